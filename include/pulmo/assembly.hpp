@@ -1,0 +1,81 @@
+/// @file
+/// The loop over cells: gathers coefficients in blocks, integrates them through PetscFE, adds the element vectors
+/// and matrices. Positions in the sparse matrix are found once; no more than one block of element matrices exists.
+#pragma once
+
+#include "pulmo/integration.hpp"
+#include "pulmo/kinematics.hpp"
+
+#include <cstdint>
+#include <vector>
+
+namespace pulmo {
+
+/// What a state of the lung measures, over all ranks.
+struct Measures {
+  PetscReal volume_change = 0;        ///< int (J - 1) over the reference volume, mm^3
+  PetscReal min_J = 1, max_J = 1;     ///< over quadrature points and cell corners
+  PetscReal min_J_points = 1;         ///< over quadrature points only
+  PetscReal where[3] = {0, 0, 0};     ///< material centroid of the cell with min_J, mm
+  PetscInt cell = -1;                 ///< its number on rank @p rank
+  PetscMPIInt rank = 0;
+};
+
+/// Assembly over the cells and named facets of a DM whose fields, PetscDS and sections are complete.
+class Assembly {
+public:
+  /// Cells per block: the element matrices of a block stay in the second-level cache.
+  static constexpr PetscInt block_cells = 32;
+  /// One block in so many is timed callback by callback.
+  static constexpr PetscInt timed_share = 16;
+
+  Assembly() = default;
+  ~Assembly();
+  Assembly(const Assembly &) = delete;
+  Assembly &operator=(const Assembly &) = delete;
+
+  PetscErrorCode setup(DM dm);
+
+  /// F = residual of the local vectors @p x and @p x_t; rows of field f are multiplied by row_scale[f].
+  PetscErrorCode residual(PetscReal t, Vec x, Vec x_t, const PetscReal row_scale[], Vec F);
+  /// A = dF/dx + shift dF/dx_t, rows scaled alike.
+  PetscErrorCode jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[], Mat A);
+  /// J and its integral for the local vector @p x.
+  PetscErrorCode measure(Vec x, Measures &measures) const;
+
+  /// Kinematic states at the quadrature points, then the corners, of cell @p c (counted from 0).
+  void point_states(PetscInt c, const PetscScalar *x, std::vector<PointState> &states) const;
+  /// Weights of the quadrature points, summing to 1.
+  const std::vector<PetscReal> &relative_weights() const { return relative_weights_; }
+  PetscInt cells() const { return cells_; }
+  const IntegrationLog &log() const { return log_; }
+
+private:
+  const PetscInt *cell_dofs(PetscInt c) const { return &cell_dofs_[c * element_size_]; }
+  struct Facets;
+  struct MatrixMap;
+
+  PetscErrorCode setup_cells();
+  PetscErrorCode setup_facets();
+  void gather(PetscInt cell, const ReadArray &x, PetscScalar *coefficients) const;
+  PetscFEGeom block_geometry(PetscInt begin, PetscInt n);
+  PetscErrorCode map_matrix(Mat A);
+  PetscErrorCode add_to_matrix(PetscInt cell, const PetscScalar *matrix, const PetscReal row_scale[], Mat A);
+
+  DM dm_ = nullptr; ///< not owned
+  PetscDS ds_ = nullptr;
+  PetscInt n_fields_ = 0, cells_ = 0, first_cell_ = 0, element_size_ = 0, points_per_cell_ = 0;
+  std::vector<PetscInt> cell_dofs_;   ///< [cell][element_size]: offset in the local vector
+  std::vector<PetscInt> cell_points_; ///< [cell][points_per_cell]: mesh points that carry dofs
+  std::vector<PetscInt> dof_point_;   ///< [element_size]: which of these points a dof of the element belongs to
+  std::vector<PetscInt> dof_field_;   ///< [element_size]
+  std::vector<PetscReal> v0_, J_, invJ_, detJ_;
+  std::vector<PetscReal> sample_gradients_; ///< d(basis)/d(xi) at quadrature points, then corners: [point][node][3]
+  PetscInt sample_points_ = 0, nodes_ = 0;
+  std::vector<PetscReal> sample_weights_, relative_weights_;
+  std::vector<Facets *> facets_;
+  MatrixMap *map_ = nullptr;
+  IntegrationLog log_;
+};
+
+} // namespace pulmo

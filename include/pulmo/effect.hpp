@@ -1,0 +1,185 @@
+/// @file
+/// What an effect is: options, fields, weak-form terms, constraints, declared in one header in pulmo/effects/.
+///
+/// An effect that a scene does not ask for only lists its options; it adds no field, no term, no matrix block.
+#pragma once
+
+#include "pulmo/options.hpp"
+#include "pulmo/permeability.hpp"
+#include "pulmo/point.hpp"
+#include "pulmo/programme.hpp"
+#include "pulmo/tissue_law.hpp"
+
+#include <functional>
+#include <memory>
+#include <string>
+#include <vector>
+
+namespace pulmo {
+
+class Mesh;
+
+/// A finite-element field: P1, P2, ... Lagrange on tetrahedra.
+struct FieldSpec {
+  std::string name;
+  PetscInt components;
+  PetscInt degree;
+  std::string unit;
+  std::string effect; ///< who brought it
+};
+
+/// One term of the weak form: callbacks of one residual row, or of one Jacobian block.
+struct Term {
+  std::string effect, name;
+  std::string surface; ///< empty: the whole volume
+  PetscInt test = displacement;
+  PetscInt trial = -1; ///< -1: a residual term
+  PetscPointFunc f0 = nullptr, f1 = nullptr;
+  PetscPointJac g0 = nullptr, g1 = nullptr, g2 = nullptr, g3 = nullptr;
+  PetscBdPointFunc bd_f0 = nullptr, bd_f1 = nullptr;
+  PetscBdPointJac bd_g0 = nullptr, bd_g1 = nullptr, bd_g2 = nullptr, bd_g3 = nullptr;
+};
+
+/// Prescribed values of some components of a field, on a surface or at single vertices.
+struct Constraint {
+  std::string effect, name;
+  PetscInt field = displacement;
+  bool component[3] = {false, false, false};
+  std::string surface;                ///< empty: at @p vertices
+  std::vector<PetscInt> vertices;     ///< local mesh points (on every rank that has them)
+  bool at_airway = false;             ///< the condition that the ventilator steers
+  /// Value of all components at time t (s) and material point x (mm).
+  std::function<void(PetscReal t, const PetscReal x[3], PetscScalar value[3])> value;
+};
+
+/// A block of kernel parameters that lives in an effect and is copied into PetscDS before each evaluation.
+struct ParameterBlock {
+  const char *owner;
+  const PetscScalar *data;
+  PetscInt count;
+};
+
+/// What the effects of a scene put together; filled by Effect::fields and Effect::terms.
+class Composition {
+public:
+  explicit Composition(const Mesh &mesh) : mesh_(mesh) {}
+
+  const Mesh &mesh() const { return mesh_; }
+  /// Names the effect that speaks next (used by the ledger).
+  void speaker(const std::string &effect) { effect_ = effect; }
+
+  void field(const std::string &name, PetscInt components, PetscInt degree, const std::string &unit)
+  {
+    fields_.push_back({name, components, degree, unit, effect_});
+  }
+  bool has_pressure() const { return fields_.size() > static_cast<std::size_t>(pressure); }
+
+  /// Hands a struct of parameters to the kernels. The struct must outlive the model.
+  template <class P>
+  void parameters(const P &p)
+  {
+    parameters(P::owner, reinterpret_cast<const PetscScalar *>(&p), sizeof(P) / sizeof(PetscScalar));
+  }
+  void parameters(const char *owner, const PetscScalar *data, PetscInt count)
+  {
+    parameters_.push_back({owner, data, count});
+  }
+
+  void residual(const std::string &name, PetscInt test, PetscPointFunc f0, PetscPointFunc f1)
+  {
+    Term t = term(name, "", test, -1);
+    t.f0 = f0;
+    t.f1 = f1;
+    terms_.push_back(t);
+  }
+  void jacobian(const std::string &name, PetscInt test, PetscInt trial, PetscPointJac g0, PetscPointJac g1,
+                PetscPointJac g2, PetscPointJac g3)
+  {
+    Term t = term(name, "", test, trial);
+    t.g0 = g0;
+    t.g1 = g1;
+    t.g2 = g2;
+    t.g3 = g3;
+    terms_.push_back(t);
+  }
+  void surface_residual(const std::string &name, const std::string &surface, PetscInt test, PetscBdPointFunc f0,
+                        PetscBdPointFunc f1)
+  {
+    Term t = term(name, surface, test, -1);
+    t.bd_f0 = f0;
+    t.bd_f1 = f1;
+    terms_.push_back(t);
+  }
+  void surface_jacobian(const std::string &name, const std::string &surface, PetscInt test, PetscInt trial,
+                        PetscBdPointJac g0, PetscBdPointJac g1, PetscBdPointJac g2, PetscBdPointJac g3)
+  {
+    Term t = term(name, surface, test, trial);
+    t.bd_g0 = g0;
+    t.bd_g1 = g1;
+    t.bd_g2 = g2;
+    t.bd_g3 = g3;
+    terms_.push_back(t);
+  }
+  void constrain(Constraint c)
+  {
+    c.effect = effect_;
+    constraints_.push_back(std::move(c));
+  }
+
+  const std::vector<FieldSpec> &fields() const { return fields_; }
+  const std::vector<Term> &terms() const { return terms_; }
+  const std::vector<Constraint> &constraints() const { return constraints_; }
+  const std::vector<ParameterBlock> &parameter_blocks() const { return parameters_; }
+
+private:
+  Term term(const std::string &name, const std::string &surface, PetscInt test, PetscInt trial) const
+  {
+    Term t;
+    t.effect = effect_;
+    t.name = name;
+    t.surface = surface;
+    t.test = test;
+    t.trial = trial;
+    return t;
+  }
+
+  const Mesh &mesh_;
+  std::string effect_;
+  std::vector<FieldSpec> fields_;
+  std::vector<Term> terms_;
+  std::vector<Constraint> constraints_;
+  std::vector<ParameterBlock> parameters_;
+};
+
+/// What one effect may know of the scene beside itself.
+struct SceneFacts {
+  bool airflow = false;                        ///< the pressure field exists
+  std::shared_ptr<const Programme> ventilator; ///< null without a ventilator
+  /// Pressure prescribed at the airway at time t, kPa (0 without a ventilator).
+  PetscReal airway_pressure(PetscReal t) const { return ventilator ? ventilator->pressure(t) : 0; }
+};
+
+/// One physical effect.
+class Effect {
+public:
+  virtual ~Effect() = default;
+
+  /// The option prefix, and the owner of its parameters.
+  virtual const char *name() const = 0;
+  /// One line for -help and the ledger: what it is and where it is published.
+  virtual const char *about() const = 0;
+  /// Declares all options, whether or not the scene asks for the effect, and learns whether it does.
+  virtual PetscErrorCode declare(Options &options) = 0;
+  /// Whether the scene asks for it (after declare()).
+  virtual bool active() const = 0;
+  /// Tells the other effects what they may need to know.
+  virtual PetscErrorCode announce(SceneFacts &) { return PETSC_SUCCESS; }
+  /// Checks against the mesh and the other effects; errors name the option and the mend.
+  virtual PetscErrorCode check(const Options &, const Mesh &, const SceneFacts &) { return PETSC_SUCCESS; }
+  /// Adds its fields.
+  virtual void fields(Composition &) const {}
+  /// Adds its parameters, terms and constraints.
+  virtual PetscErrorCode terms(Composition &, const SceneFacts &) const { return PETSC_SUCCESS; }
+};
+
+} // namespace pulmo

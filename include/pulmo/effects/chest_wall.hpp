@@ -1,0 +1,115 @@
+/// @file
+/// Effect `chest_wall`: springs between lung surface and surroundings (Aviles-Rojas & Hurtado 2022, eq. 39).
+///
+/// Traction T = -K_s u (the paper prints +K_s, which would push outward), by default with the full
+/// displacement vector on pleura and airway: the reading that reproduces the paper's Table 2. Direction
+/// `normal` is the paper's text, T = -K_s (u . N) N.
+#pragma once
+
+#include "pulmo/effect.hpp"
+#include "pulmo/mesh.hpp"
+
+#include <array>
+#include <utility>
+
+namespace pulmo {
+
+struct ChestWallKernels {
+  static constexpr std::size_t max_surfaces = 8;
+
+  struct Parameters {
+    static constexpr const char *owner = "chest_wall";
+    PetscScalar stiffness[max_surfaces]; ///< K_s of each surface, kPa/mm
+    PetscScalar normal_only;             ///< 1: only the normal component is resisted
+  };
+
+  /// f0 = K_s u, or K_s (u . N) N.
+  template <std::size_t I>
+  static void spring(const Point &point, const Parameters &k, PetscScalar f0[])
+  {
+    const PetscScalar *u = point.u, K = k.stiffness[I];
+    const PetscReal *N = point.normal;
+    const PetscScalar u_N = u[0] * N[0] + u[1] * N[1] + u[2] * N[2];
+    for (int i = 0; i < 3; ++i) f0[i] += K * (k.normal_only != 0 ? u_N * N[i] : u[i]);
+  }
+  template <std::size_t I>
+  static void spring_tangent(const Point &point, const Parameters &k, PetscScalar g0[])
+  {
+    const PetscReal *N = point.normal;
+    for (int i = 0; i < 3; ++i)
+      for (int j = 0; j < 3; ++j) g0[3 * i + j] += k.stiffness[I] * (k.normal_only != 0 ? N[i] * N[j] : i == j);
+  }
+
+  /// The callbacks of each surface, so that a kernel knows its stiffness.
+  template <std::size_t... I>
+  static constexpr std::array<PetscBdPointFunc, sizeof...(I)> residuals(std::index_sequence<I...>)
+  {
+    return {surface_residual<Parameters, spring<I>>...};
+  }
+  template <std::size_t... I>
+  static constexpr std::array<PetscBdPointJac, sizeof...(I)> jacobians(std::index_sequence<I...>)
+  {
+    return {surface_jacobian<Parameters, spring_tangent<I>>...};
+  }
+};
+
+class ChestWall final : public Effect {
+public:
+  const char *name() const override { return "chest_wall"; }
+  const char *about() const override { return "springs on the lung surface (chest wall, eq. 39)"; }
+  bool active() const override { return on_; }
+
+  PetscErrorCode declare(Options &options) override
+  {
+    PetscReal common = 0.08;
+
+    PetscFunctionBeginUser;
+    options.group(name(), about());
+    PetscCall(options.flag("", "springs hold the lung surface", on_));
+    options.group(name(), about(), on_, "-chest_wall");
+    PetscCall(options.names("surfaces", "surfaces with springs", surfaces_));
+    PetscCall(options.real("stiffness", "kPa/mm", Range::not_negative(), "spring stiffness K_s per area", common));
+    PetscCall(options.choice("direction", {"full", "normal"}, "what a spring resists: u, or u . N", direction_));
+    PulmoUserCheck(surfaces_.size() <= ChestWallKernels::max_surfaces, options.comm(),
+                   "-chest_wall_surfaces names more than %d surfaces; join some of them in the mesh",
+                   static_cast<int>(ChestWallKernels::max_surfaces));
+    for (std::size_t i = 0; i < surfaces_.size(); ++i) {
+      PetscReal own = common;
+      PetscCall(options.real("stiffness_" + surfaces_[i], "kPa/mm", Range::not_negative(),
+                             "K_s of surface " + surfaces_[i], own));
+      parameters_.stiffness[i] = own;
+    }
+    parameters_.normal_only = direction_ == "normal";
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+  PetscErrorCode check(const Options &, const Mesh &mesh, const SceneFacts &) override
+  {
+    PetscFunctionBeginUser;
+    PetscCall(mesh.require_surfaces(surfaces_, "-chest_wall_surfaces"));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+  PetscErrorCode terms(Composition &c, const SceneFacts &) const override
+  {
+    using K = ChestWallKernels;
+    static constexpr auto residuals = K::residuals(std::make_index_sequence<K::max_surfaces>());
+    static constexpr auto jacobians = K::jacobians(std::make_index_sequence<K::max_surfaces>());
+
+    PetscFunctionBeginUser;
+    c.parameters(parameters_);
+    for (std::size_t i = 0; i < surfaces_.size(); ++i) {
+      c.surface_residual("K_s u . eta", surfaces_[i], displacement, residuals[i], nullptr);
+      c.surface_jacobian("K_s", surfaces_[i], displacement, displacement, jacobians[i], nullptr, nullptr, nullptr);
+    }
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+private:
+  bool on_ = false;
+  std::string direction_ = "full";
+  std::vector<std::string> surfaces_{"pleura", "airway"};
+  ChestWallKernels::Parameters parameters_{};
+};
+
+} // namespace pulmo

@@ -1,0 +1,64 @@
+/// @file
+/// The mesh of a scene: reading, scaling, distribution, checks, named surfaces.
+#pragma once
+
+#include "pulmo/options.hpp"
+
+#include <array>
+#include <map>
+
+namespace pulmo {
+
+/// A tetrahedral DMPlex with named surfaces. Coordinates in mm.
+class Mesh {
+public:
+  /// A named surface: the exterior facets that carry the physical name.
+  struct Surface {
+    DMLabel label = nullptr; ///< owned by the DM
+    PetscInt value = 0;      ///< stratum of the label
+    PetscReal area = 0;      ///< mm^2, reference configuration, all ranks
+  };
+  /// A vertex held against rigid motion (Mesh::rigid_pins).
+  struct Pin {
+    PetscInt vertex = -1; ///< local mesh point, -1 on ranks without it
+    bool component[3] = {false, false, false};
+    PetscReal x[3] = {0, 0, 0}; ///< mm
+  };
+
+  /// Declares -mesh_scale; the file name is PETSc's -dm_plex_filename.
+  PetscErrorCode declare(Options &options);
+  /// Reads -dm_plex_filename, scales, distributes and checks it. @p ventilated: the scene is a lung, so a volume
+  /// outside what any lung has betrays the wrong unit.
+  PetscErrorCode read(const Options &options, bool ventilated);
+
+  DM dm() const { return dm_; }
+  PetscReal volume() const { return volume_; } ///< mm^3, reference configuration
+  PetscReal length() const { return length_; } ///< mean cell size (volume per cell)^(1/3), mm
+  PetscInt cells() const { return cells_; }    ///< on all ranks
+  const std::map<std::string, Surface> &surfaces() const { return surfaces_; }
+  const Surface &surface(const std::string &name) const { return surfaces_.at(name); }
+
+  /// User error, naming @p option and the surfaces that exist, unless all @p names are surfaces of the mesh.
+  PetscErrorCode require_surfaces(const std::vector<std::string> &names, const std::string &option) const;
+  /// Three vertices and 3, 2, 1 components that remove exactly the six rigid-body modes.
+  PetscErrorCode rigid_pins(std::array<Pin, 3> &pins) const;
+  /// Coordinates of a vertex or of the middle of an edge, mm.
+  PetscErrorCode node_coordinates(PetscInt point, PetscReal x[3]) const;
+
+private:
+  PetscErrorCode check_cells(const Options &options);
+  PetscErrorCode find_surfaces(const Options &options);
+  std::string surface_names() const;
+
+  DMHandle dm_;
+  std::string file_;
+  PetscReal scale_ = 1, volume_ = 0, length_ = 0;
+  bool scale_given_ = false;
+  PetscInt cells_ = 0;
+  std::map<std::string, Surface> surfaces_;
+};
+
+/// Makes `-petscpartitioner_type metis` known to PETSc (METIS k-way on the rank that holds the mesh).
+PetscErrorCode register_metis_partitioner();
+
+} // namespace pulmo

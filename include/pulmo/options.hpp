@@ -1,0 +1,91 @@
+/// @file
+/// Options: each is declared once with name, unit, range, default and help; parsing, `-help`, range checks,
+/// the list in summary.json and the search for misspelt names all come from that one declaration.
+#pragma once
+
+#include "pulmo/petsc.hpp"
+
+#include <limits>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace pulmo {
+
+/// The admissible values of a number.
+struct Range {
+  double low = -std::numeric_limits<double>::infinity();
+  double high = std::numeric_limits<double>::infinity();
+  bool open = false; ///< the ends themselves are not allowed
+
+  static Range any() { return {}; }
+  static Range positive() { return {0, std::numeric_limits<double>::infinity(), true}; }
+  static Range not_negative() { return {0, std::numeric_limits<double>::infinity(), false}; }
+  static Range between(double low, double high) { return {low, high, false}; }
+  bool holds(double v) const { return open ? v > low && v < high : v >= low && v <= high; }
+  std::string text() const;
+};
+
+/// Declares and reads pulmo's own options from PETSc's database.
+///
+/// Every function reads the option `-<group>_<name>` (or `-<group>` for an empty name) into @p value, whose
+/// content on entry is the default. Errors are user errors that name the option and the mend.
+class Options {
+public:
+  explicit Options(MPI_Comm comm) : comm_(comm) {}
+
+  MPI_Comm comm() const { return comm_; }
+
+  /// What follows belongs to option prefix @p name. A group that is not @p in_use is listed by -help, and an
+  /// option given for it is an error that quotes @p enabled_by.
+  void group(const std::string &name, const std::string &about, bool in_use = true, const std::string &enabled_by = "");
+
+  PetscErrorCode real(const std::string &name, const std::string &unit, Range range, const std::string &help,
+                      PetscReal &value);
+  PetscErrorCode whole(const std::string &name, const std::string &unit, Range range, const std::string &help,
+                       PetscInt &value);
+  PetscErrorCode flag(const std::string &name, const std::string &help, bool &value);
+  PetscErrorCode text(const std::string &name, const std::string &help, std::string &value);
+  /// One of @p choices.
+  PetscErrorCode choice(const std::string &name, const std::vector<std::string> &choices, const std::string &help,
+                        std::string &value);
+  /// Names separated by commas.
+  PetscErrorCode names(const std::string &name, const std::string &help, std::vector<std::string> &value);
+  /// Three numbers separated by commas.
+  PetscErrorCode vector(const std::string &name, const std::string &unit, const std::string &help, PetscReal value[3]);
+
+  /// Whether the user gave `-<group>_<name>` of the current group.
+  PetscErrorCode given(const std::string &name, bool &is_given) const;
+
+  /// Ends with a user error if the database holds a name under one of pulmo's prefixes that nothing declared.
+  PetscErrorCode check_unknown() const;
+  /// Warns of PETSc options that nobody read, with the nearest name that pulmo knows.
+  PetscErrorCode warn_unused() const;
+  /// Prints every declared option (the part of -help that is pulmo's own).
+  PetscErrorCode print_help() const;
+  /// The full name and value of each option in the database, as the run used them.
+  PetscErrorCode all_given(std::vector<std::pair<std::string, std::string>> &list) const;
+
+private:
+  struct Declared {
+    std::string name, value, unit, range, help;
+    std::size_t group;
+  };
+  struct Group {
+    std::string name, about, enabled_by;
+    bool in_use;
+  };
+
+  PetscErrorCode find(const std::string &name, const std::string &default_value, const std::string &unit,
+                      const std::string &range, const std::string &help, std::string &raw, bool &is_given);
+  PetscErrorCode parse_number(const std::string &option, const std::string &raw, const std::string &unit,
+                              const Range &range, double &value) const;
+  std::string full(const std::string &name) const;
+  std::string nearest(const std::string &name) const;
+
+  MPI_Comm comm_;
+  std::vector<Group> groups_;
+  std::vector<Declared> declared_;
+};
+
+} // namespace pulmo

@@ -1,0 +1,81 @@
+/// @file
+/// Permeability laws of the airflow effect: k(J) in mm^2/(kPa s), spatially isotropic (k = kappa / eta).
+///
+/// A law is a struct with `name`, `uses` (one line), `Parameters` (owner "permeability"), `declare` and
+/// `Value permeability(J, Parameters)`, and one line in src/registry.cpp.
+#pragma once
+
+#include "pulmo/options.hpp"
+#include "pulmo/point.hpp"
+
+namespace pulmo {
+
+/// k and its derivative by J.
+struct PermeabilityValue {
+  PetscScalar k;     ///< mm^2/(kPa s)
+  PetscScalar dk_dJ; ///< mm^2/(kPa s)
+};
+
+/// k constant in the deformed configuration (the paper's choice).
+struct ConstantPermeability {
+  static constexpr const char *name = "constant";
+
+  struct Parameters {
+    static constexpr const char *owner = "permeability";
+    PetscScalar k = 1e4; ///< mm^2/(kPa s)
+  };
+
+  static PetscErrorCode declare(Options &options, Parameters &p)
+  {
+    PetscFunctionBeginUser;
+    PetscCall(options.real("permeability", "mm^2/(kPa s)", Range::positive(), "permeability over viscosity", p.k));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+  static PermeabilityValue permeability(PetscScalar, const Parameters &p) { return {p.k, 0}; }
+};
+
+/// The flux kernels of airflow with permeability law @p Law; see effects/airflow.hpp.
+template <class Law>
+struct DarcyKernels;
+
+/// A permeability law chosen at run time.
+class PermeabilityLaw {
+public:
+  virtual ~PermeabilityLaw() = default;
+  virtual const char *name() const = 0;
+  virtual PetscErrorCode declare(Options &options) = 0;
+  virtual const PetscScalar *parameters(PetscInt *count) const = 0;
+  virtual PetscPointFunc flux_callback() const = 0;
+  virtual PetscPointJac flux_by_displacement_callback() const = 0;
+  virtual PetscPointJac flux_by_pressure_callback() const = 0;
+};
+
+template <class Law>
+class PermeabilityLawOf final : public PermeabilityLaw {
+public:
+  using Kernels = DarcyKernels<Law>;
+  using Parameters = typename Law::Parameters;
+
+  const char *name() const override { return Law::name; }
+  PetscErrorCode declare(Options &options) override { return Law::declare(options, parameters_); }
+  const PetscScalar *parameters(PetscInt *count) const override
+  {
+    *count = sizeof(Parameters) / sizeof(PetscScalar);
+    return reinterpret_cast<const PetscScalar *>(&parameters_);
+  }
+  PetscPointFunc flux_callback() const override { return volume_residual<Parameters, Kernels::flux>; }
+  PetscPointJac flux_by_displacement_callback() const override
+  {
+    return volume_jacobian<Parameters, Kernels::flux_by_displacement>;
+  }
+  PetscPointJac flux_by_pressure_callback() const override
+  {
+    return volume_jacobian<Parameters, Kernels::flux_by_pressure>;
+  }
+
+private:
+  Parameters parameters_;
+};
+
+} // namespace pulmo

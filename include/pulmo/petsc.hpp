@@ -1,0 +1,119 @@
+/// @file
+/// PETSc as pulmo uses it: version compatibility, owning handles, errors that a user can mend.
+#pragma once
+
+#include <petscdmplex.h>
+#include <petscds.h>
+#include <petscsf.h>
+#include <petscts.h>
+
+#include <string>
+#include <utility>
+
+#if PETSC_VERSION_LT(3, 18, 0)
+#error "pulmo needs PETSc 3.18 or newer"
+#endif
+
+// PETSc 3.19 turned error codes into an enum and named its zero.
+#ifndef PETSC_SUCCESS
+#define PETSC_SUCCESS static_cast<PetscErrorCode>(0)
+#endif
+
+/// Ends the calling function with an error that the user can mend: one sentence, no stack trace.
+/// Collective: every rank of the communicator must reach it with the same message.
+#define PulmoUserError(comm, ...) SETERRQ(comm, PETSC_ERR_USER_INPUT, __VA_ARGS__)
+
+/// PulmoUserError unless @p condition holds.
+#define PulmoUserCheck(condition, comm, ...)                              \
+  do {                                                                    \
+    if (PetscUnlikely(!(condition))) PulmoUserError(comm, __VA_ARGS__);   \
+  } while (0)
+
+namespace pulmo {
+
+/// Owns one PETSc object and destroys it with @p Destroy. Movable, not copyable.
+template <class T, PetscErrorCode (*Destroy)(T *)>
+class Handle {
+public:
+  Handle() = default;
+  ~Handle() { reset(); }
+  Handle(const Handle &) = delete;
+  Handle &operator=(const Handle &) = delete;
+  Handle(Handle &&other) noexcept : object_(std::exchange(other.object_, nullptr)) {}
+  Handle &operator=(Handle &&other) noexcept
+  {
+    if (this != &other) {
+      reset();
+      object_ = std::exchange(other.object_, nullptr);
+    }
+    return *this;
+  }
+
+  operator T() const { return object_; }
+  /// For PETSc's creating functions: destroys what is held and gives the place of the new object.
+  T *out()
+  {
+    reset();
+    return &object_;
+  }
+  /// The place of the object that is held, for functions that change it in place.
+  T *inout() { return &object_; }
+  /// Shares an object that someone else owns too (PETSc counts references).
+  void share(T object)
+  {
+    if (object) (void)PetscObjectReference(reinterpret_cast<PetscObject>(object));
+    reset();
+    object_ = object;
+  }
+  void reset()
+  {
+    if (object_) (void)Destroy(&object_);
+    object_ = nullptr;
+  }
+
+private:
+  T object_ = nullptr;
+};
+
+using DMHandle = Handle<DM, DMDestroy>;
+using FEHandle = Handle<PetscFE, PetscFEDestroy>;
+using ISHandle = Handle<IS, ISDestroy>;
+using LabelHandle = Handle<DMLabel, DMLabelDestroy>;
+using MatHandle = Handle<Mat, MatDestroy>;
+using QuadratureHandle = Handle<PetscQuadrature, PetscQuadratureDestroy>;
+using SectionHandle = Handle<PetscSection, PetscSectionDestroy>;
+using TSHandle = Handle<TS, TSDestroy>;
+using VecHandle = Handle<Vec, VecDestroy>;
+using ViewerHandle = Handle<PetscViewer, PetscViewerDestroy>;
+
+/// Read access to the entries of a Vec for the life of this object.
+class ReadArray {
+public:
+  explicit ReadArray(Vec v) : vec_(v) { (void)VecGetArrayRead(vec_, &data_); }
+  ~ReadArray() { (void)VecRestoreArrayRead(vec_, &data_); }
+  ReadArray(const ReadArray &) = delete;
+  ReadArray &operator=(const ReadArray &) = delete;
+  const PetscScalar *data() const { return data_; }
+  PetscScalar operator[](PetscInt i) const { return data_[i]; }
+
+private:
+  Vec vec_;
+  const PetscScalar *data_ = nullptr;
+};
+
+/// Write access to the entries of a Vec for the life of this object.
+class WriteArray {
+public:
+  explicit WriteArray(Vec v) : vec_(v) { (void)VecGetArray(vec_, &data_); }
+  ~WriteArray() { (void)VecRestoreArray(vec_, &data_); }
+  WriteArray(const WriteArray &) = delete;
+  WriteArray &operator=(const WriteArray &) = delete;
+  PetscScalar *data() { return data_; }
+  PetscScalar &operator[](PetscInt i) { return data_[i]; }
+
+private:
+  Vec vec_;
+  PetscScalar *data_ = nullptr;
+};
+
+} // namespace pulmo

@@ -1,0 +1,166 @@
+/// @file
+/// Between PETSc's pointwise callbacks and the physics: kernels see a `Point` and their own parameter
+/// struct, never raw arrays.
+///
+/// A kernel is a static function `void k(const Point &, const Parameters &, PetscScalar out[])` that ADDS
+/// its share to `out`. The adaptors below turn it into the callback that PetscDS and PetscWeakForm take:
+///
+///   residual terms:  f0[c], f1[3 * c + d]                    for the weak form  f0 . q + f1 : Grad q
+///   jacobian terms:  g0[Nj * c + e], g1[(Nj * c + e) * 3 + d] (Grad of the trial field),
+///                    g2[(Nj * c + e) * 3 + d] (Grad of the test field), g3[((Nj * c + e) * 3 + d) * 3 + l]
+#pragma once
+
+#include "pulmo/kinematics.hpp"
+#include "pulmo/petsc.hpp"
+
+#include <cstdint>
+#include <cstring>
+#include <string_view>
+#include <type_traits>
+
+namespace pulmo {
+
+/// Order of the fields that pulmo's kernels know. Displacement is always there, pressure only with airflow.
+enum FieldIndex : PetscInt { displacement = 0, pressure = 1 };
+
+/// The constants of PetscDS are a directory: [n, (tag, offset) x n, payload]. Each effect finds its own
+/// block by the tag made from its name and needs to know of no other.
+namespace constants {
+
+/// 50-bit FNV-1a hash of an effect's name: exact in a double.
+constexpr PetscScalar tag(std::string_view name)
+{
+  std::uint64_t h = 1469598103934665603ull;
+  for (char c : name) h = (h ^ static_cast<unsigned char>(c)) * 1099511628211ull;
+  return static_cast<PetscScalar>(h >> 14);
+}
+
+/// The parameter block of type @p P (a struct of PetscScalars that names its owner in `P::owner`).
+template <class P>
+P get(const PetscScalar c[])
+{
+  P p{};
+  if constexpr (!std::is_empty_v<P>) {
+    static_assert(std::is_trivially_copyable_v<P> && sizeof(P) % sizeof(PetscScalar) == 0,
+                  "parameters reach the kernels as plain scalars");
+    constexpr PetscScalar wanted = tag(P::owner);
+    const auto n = static_cast<PetscInt>(c[0]);
+    for (PetscInt i = 0; i < n; ++i) {
+      if (c[1 + 2 * i] == wanted) {
+        std::memcpy(static_cast<void *>(&p), c + static_cast<PetscInt>(c[2 + 2 * i]), sizeof(P));
+        break;
+      }
+    }
+  }
+  return p;
+}
+
+} // namespace constants
+
+/// For kernels without parameters of their own.
+struct NoParameters {};
+
+/// What the time step tells every kernel.
+struct Step {
+  static constexpr const char *owner = "step";
+  PetscScalar dt;           ///< size of the step, s
+  PetscScalar gas_pressure; ///< pressure prescribed at the airway, kPa
+};
+
+/// A quadrature point as a kernel sees it.
+struct Point {
+  const PointState &state;         ///< F, J, rates
+  const PetscScalar *u;            ///< displacement, mm
+  PetscScalar p = 0;               ///< alveolar pressure, kPa (airflow only)
+  const PetscScalar *grad_p;       ///< Grad p, kPa/mm (null without airflow)
+  PetscReal t;                     ///< time, s
+  PetscReal shift;                 ///< d(u_t)/du in Jacobians, 1/s
+  const PetscReal *x;              ///< material coordinates, mm
+  const PetscReal *normal;         ///< outward unit normal (surface kernels only)
+  Step step;
+
+  /// Pressure of the gas in the pores: the local field, or the uniform pressure without airflow, kPa.
+  PetscScalar gas_pressure() const { return grad_p ? p : step.gas_pressure; }
+};
+
+/// NfAux that says: the auxiliary array is a PointState made by pulmo's integrator.
+constexpr PetscInt precomputed_state = -1;
+
+namespace detail {
+
+/// The arguments that all four kinds of callback begin with.
+#define PULMO_POINT_ARGUMENTS                                                                                     \
+  PetscInt, PetscInt Nf, PetscInt NfAux, const PetscInt uOff[], const PetscInt uOff_x[], const PetscScalar u[],   \
+    const PetscScalar[], const PetscScalar u_x[], const PetscInt[], const PetscInt aOff_x[], const PetscScalar a[], \
+    const PetscScalar[], const PetscScalar a_x[], PetscReal t
+
+/// The state at a point: handed in by pulmo's integrator, or made here (stock PetscFE, where an auxiliary
+/// field of the same discretisation carries u_t).
+static inline const PointState &state_of(PetscInt NfAux, const PetscInt uOff_x[], const PetscScalar u_x[],
+                                         const PetscInt aOff_x[], const PetscScalar a[], const PetscScalar a_x[],
+                                         PointState &storage)
+{
+  if (NfAux == precomputed_state) return *reinterpret_cast<const PointState *>(a);
+  make_point_state(u_x + uOff_x[displacement], NfAux > 0 ? a_x + aOff_x[displacement] : nullptr, storage);
+  return storage;
+}
+
+} // namespace detail
+
+template <class P>
+using Kernel = void (*)(const Point &, const P &, PetscScalar[]);
+
+/// Callback of a volume residual term (f0 or f1).
+template <class P, Kernel<P> K>
+void volume_residual(PULMO_POINT_ARGUMENTS, const PetscReal x[], PetscInt, const PetscScalar c[], PetscScalar f[])
+{
+  PointState storage;
+  const PointState &s = detail::state_of(NfAux, uOff_x, u_x, aOff_x, a, a_x, storage);
+  const bool gas = Nf > pressure;
+  K({s, u + uOff[displacement], gas ? u[uOff[pressure]] : 0, gas ? u_x + uOff_x[pressure] : nullptr, t, 0, x, nullptr,
+     constants::get<Step>(c)},
+    constants::get<P>(c), f);
+}
+
+/// Callback of a volume Jacobian term (g0 ... g3).
+template <class P, Kernel<P> K>
+void volume_jacobian(PULMO_POINT_ARGUMENTS, PetscReal shift, const PetscReal x[], PetscInt, const PetscScalar c[],
+                     PetscScalar g[])
+{
+  PointState storage;
+  const PointState &s = detail::state_of(NfAux, uOff_x, u_x, aOff_x, a, a_x, storage);
+  const bool gas = Nf > pressure;
+  K({s, u + uOff[displacement], gas ? u[uOff[pressure]] : 0, gas ? u_x + uOff_x[pressure] : nullptr, t, shift, x,
+     nullptr, constants::get<Step>(c)},
+    constants::get<P>(c), g);
+}
+
+/// Callback of a surface residual term.
+template <class P, Kernel<P> K>
+void surface_residual(PULMO_POINT_ARGUMENTS, const PetscReal x[], const PetscReal n[], PetscInt, const PetscScalar c[],
+                      PetscScalar f[])
+{
+  PointState storage;
+  const PointState &s = detail::state_of(NfAux, uOff_x, u_x, aOff_x, a, a_x, storage);
+  const bool gas = Nf > pressure;
+  K({s, u + uOff[displacement], gas ? u[uOff[pressure]] : 0, gas ? u_x + uOff_x[pressure] : nullptr, t, 0, x, n,
+     constants::get<Step>(c)},
+    constants::get<P>(c), f);
+}
+
+/// Callback of a surface Jacobian term.
+template <class P, Kernel<P> K>
+void surface_jacobian(PULMO_POINT_ARGUMENTS, PetscReal shift, const PetscReal x[], const PetscReal n[], PetscInt,
+                      const PetscScalar c[], PetscScalar g[])
+{
+  PointState storage;
+  const PointState &s = detail::state_of(NfAux, uOff_x, u_x, aOff_x, a, a_x, storage);
+  const bool gas = Nf > pressure;
+  K({s, u + uOff[displacement], gas ? u[uOff[pressure]] : 0, gas ? u_x + uOff_x[pressure] : nullptr, t, shift, x, n,
+     constants::get<Step>(c)},
+    constants::get<P>(c), g);
+}
+
+#undef PULMO_POINT_ARGUMENTS
+
+} // namespace pulmo

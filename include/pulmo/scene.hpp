@@ -1,0 +1,41 @@
+/// @file
+/// A scene: the effects that the options ask for, and the mesh they act on.
+#pragma once
+
+#include "pulmo/effects/airflow.hpp"
+#include "pulmo/effects/tissue.hpp"
+#include "pulmo/effects/ventilator.hpp"
+#include "pulmo/mesh.hpp"
+#include "pulmo/registry.hpp"
+
+namespace pulmo {
+
+class Scene {
+public:
+  explicit Scene(const Registry &registry);
+
+  /// Declares the options of every effect and of the mesh.
+  PetscErrorCode declare(Options &options);
+  /// Reads the mesh and checks every active effect against it.
+  PetscErrorCode prepare(const Options &options);
+  /// What the active effects put together.
+  PetscErrorCode compose(Composition &composition) const;
+
+  const Mesh &mesh() const { return mesh_; }
+  const SceneFacts &facts() const { return facts_; }
+  const Tissue &tissue() const { return *tissue_; }
+  const Airflow &airflow() const { return *airflow_; }
+  const Ventilator &ventilator() const { return *ventilator_; }
+  /// Active effects in order of registration.
+  std::vector<const Effect *> active() const;
+
+private:
+  Mesh mesh_;
+  SceneFacts facts_;
+  std::vector<std::unique_ptr<Effect>> effects_;
+  Tissue *tissue_;         // these three are elements of effects_
+  Airflow *airflow_;
+  Ventilator *ventilator_;
+};
+
+} // namespace pulmo

@@ -1,0 +1,108 @@
+/// @file
+/// The run of a scene over time: one TSSolve per ventilator phase, step control, acceptance of steps.
+#pragma once
+
+#include "pulmo/clinical.hpp"
+#include "pulmo/model.hpp"
+#include "pulmo/scene.hpp"
+
+namespace pulmo {
+
+/// What an observer sees after each accepted step (and once at the start).
+struct StepReport {
+  SignalRow row;
+  Measures measures;
+  PetscReal mass_balance_error; ///< int (J - 1) - sum dt flow, mm^3
+  Vec local;                    ///< state with constrained values in place
+  PetscReal end;                ///< when the run ends, s
+  bool phase_ends;              ///< this row is the last of its phase
+};
+
+/// Watches a run and never steers it.
+class Observer {
+public:
+  virtual ~Observer() = default;
+  virtual PetscErrorCode observe(const StepReport &) = 0;
+};
+
+/// An attempt at a step that was not accepted.
+struct FailedAttempt {
+  PetscReal time, dt;    ///< where the step began and how long it was, s
+  std::string reason;
+  PetscInt newton;
+  Measures measures;     ///< of the last state with J <= 0, if any
+  bool inverted;
+};
+
+/// Wall seconds by stage, largest over the ranks at the end.
+struct StageSeconds {
+  double setup = 0, residual = 0, jacobian = 0, solve = 0, output = 0, total = 0;
+};
+
+class Simulation {
+public:
+  Simulation(const Options &options, const Scene &scene, Model &model) : options_(options), scene_(scene), model_(model) {}
+
+  /// Creates TS, SNES, KSP and the matrix from the options database.
+  PetscErrorCode setup();
+  /// Counts what was done before the run as set-up, s.
+  void setup_took(double seconds) { seconds_.setup = seconds; }
+  void add(Observer &observer) { observers_.push_back(&observer); }
+  /// Runs to the end. @p finished is false if no step could be accepted any more; failures() then tells why.
+  PetscErrorCode run(bool &finished);
+
+  TS ts() const { return ts_; }
+  Vec state() const { return state_; }          ///< global vector, the last accepted state
+  Vec local_state() const { return before_; }   ///< the same, local, constrained values in place
+  PetscReal time() const { return accepted_.time; }
+  const std::vector<SignalRow> &rows() const { return rows_; }
+  const std::vector<FailedAttempt> &failures() const { return failures_; }
+  PetscReal mass_balance_error() const { return worst_balance_; } ///< largest of the run, mm^3
+  PetscReal min_J() const { return min_J_; }
+  PetscInt rejected_steps() const { return rejected_; }
+  const StageSeconds &seconds() const { return seconds_; }
+  /// One paragraph on a run that could not go on: where, when, what was tried, what to try.
+  std::string failure_text() const;
+
+  // what PETSc calls back
+  PetscErrorCode residual(PetscReal t, Vec X, Vec Xdot, Vec F);
+  PetscErrorCode jacobian(PetscReal t, Vec X, Vec Xdot, PetscReal shift, Mat A);
+  PetscErrorCode after_stage();
+  PetscErrorCode accept_stage(Vec X, PetscBool *accept);
+  PetscErrorCode after_step();
+  /// Next step size after an accepted one of size @p h that ends at @p t: grows back after cuts.
+  PetscReal next_step(PetscReal t, PetscReal h, PetscReal growth);
+
+private:
+  PetscErrorCode create_solver();
+  /// Step size from time @p t, shortened to land on the end of the ramp or of the phase.
+  PetscReal landing(PetscReal t) const;
+  PetscErrorCode scatter(PetscReal t, Vec X, Vec Xdot);
+  PetscErrorCode report(const SignalRow &row, const Measures &measures);
+  std::vector<Phase> phases() const;
+
+  const Options &options_;
+  const Scene &scene_;
+  Model &model_;
+  std::vector<Observer *> observers_;
+  TSHandle ts_;
+  MatHandle matrix_;
+  VecHandle state_, local_, rate_, local_residual_, before_;
+  std::vector<Phase> phases_;
+  const Phase *phase_ = nullptr;
+  PetscReal wanted_dt_ = 0.05, dt_ = 0.05; ///< asked for; in use before any shortening to land on a time
+  PetscReal end_ = 0;
+  SignalRow accepted_;
+  std::vector<SignalRow> rows_;
+  PetscReal delivered_ = 0, worst_balance_ = 0, min_J_ = 1;
+  PetscInt newton_ = 0, krylov_ = 0, rejected_ = 0;
+  bool inverted_ = false; ///< the attempt at hand met J <= 0
+  Measures inverted_measures_;
+  std::vector<FailedAttempt> failures_;
+  StageSeconds seconds_;
+};
+
+/// Registers the TSAdapt type "pulmo": cut on failure, grow back to the step asked for, land on kinks.
+PetscErrorCode register_step_control();
+
+} // namespace pulmo

@@ -1,0 +1,11 @@
+/// @file
+/// Units: the solver works in mm, s, kPa; users speak of cmH2O, ml and ml/s.
+#pragma once
+
+namespace pulmo::units {
+
+constexpr double kPa_per_cmH2O = 0.0980665; ///< by definition of the conventional water column
+constexpr double mm3_per_ml = 1000.0;
+constexpr double mm2_per_cm2 = 100.0;
+
+} // namespace pulmo::units

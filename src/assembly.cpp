@@ -1,0 +1,591 @@
+#include "pulmo/assembly.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <numeric>
+
+namespace pulmo {
+
+/// The facets of one boundary of the PetscDS.
+struct Assembly::Facets {
+  PetscWeakForm wf = nullptr;
+  PetscFormKey key{};
+  std::vector<PetscInt> cells; ///< the cell behind each facet
+  PetscFEGeom *geom = nullptr;
+
+  ~Facets() { (void)PetscFEGeomDestroy(&geom); }
+};
+
+/// Where the entries of element matrices go in a sparse matrix. Dofs of one mesh point are neighbours in every
+/// row, and all rows of a mesh point have the same pattern: one offset per pair of mesh points of a cell is enough.
+struct Assembly::MatrixMap {
+  Mat matrix = nullptr;                     ///< identity only, not owned
+  bool direct = false;                      ///< AIJ: entries are added in place
+  Mat diagonal = nullptr, off_diagonal = nullptr;
+  const PetscInt *row_begin[2] = {nullptr, nullptr}; ///< CSR row pointers of the two parts
+  PetscScalar *values[2] = {nullptr, nullptr};       ///< their entries, while a Jacobian is assembled
+  std::vector<std::int32_t> offset;         ///< [cell][row point][column point]
+  std::vector<PetscInt> global;             ///< [local dof]: global number of a free dof, -1 if constrained
+  std::vector<PetscInt> row;                ///< [local dof]: owned: local row; ghost: -(ghost row) - 1
+  std::vector<std::int8_t> free_index;      ///< [local dof]: place among the free dofs of its mesh point, -1 constrained
+  std::vector<std::uint8_t> owned;          ///< [mesh point]
+  // rows of other ranks, summed here and sent once
+  std::vector<PetscInt> ghost_begin, ghost_columns, ghost_rows;
+  std::vector<PetscScalar> ghost_values;
+};
+
+Assembly::~Assembly()
+{
+  for (Facets *f : facets_) delete f;
+  delete map_;
+}
+
+PetscErrorCode Assembly::setup(DM dm)
+{
+  PetscFunctionBeginUser;
+  dm_ = dm;
+  PetscCall(DMGetDS(dm, &ds_));
+  PetscCall(PetscDSGetNumFields(ds_, &n_fields_));
+  PetscCall(IntegrationLog::attach(ds_, &log_));
+  PetscCall(setup_cells());
+  PetscCall(setup_facets());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Assembly::setup_cells()
+{
+  PetscSection section;
+  PetscInt last;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMGetLocalSection(dm_, &section));
+  PetscCall(DMPlexGetHeightStratum(dm_, 0, &first_cell_, &last));
+  cells_ = last - first_cell_;
+  PetscCall(PetscDSGetTotalDimension(ds_, &element_size_));
+  cell_dofs_.resize(static_cast<std::size_t>(cells_ * element_size_));
+  v0_.resize(3 * cells_);
+  J_.resize(9 * cells_);
+  invJ_.resize(9 * cells_);
+  detJ_.resize(cells_);
+  for (PetscInt c = 0; c < cells_; ++c) {
+    PetscInt *closure = nullptr, n_closure, n = 0;
+    std::vector<PetscInt> points;
+    PetscCall(DMPlexComputeCellGeometryAffineFEM(dm_, first_cell_ + c, &v0_[3 * c], &J_[9 * c], &invJ_[9 * c], &detJ_[c]));
+    PetscCall(DMPlexGetTransitiveClosure(dm_, first_cell_ + c, PETSC_TRUE, &n_closure, &closure));
+    for (PetscInt f = 0; f < n_fields_; ++f)
+      for (PetscInt i = 0; i < n_closure; ++i) {
+        const PetscInt point = closure[2 * i];
+        PetscInt dof, offset;
+        PetscCall(PetscSectionGetFieldDof(section, point, f, &dof));
+        PetscCall(PetscSectionGetFieldOffset(section, point, f, &offset));
+        if (dof == 0) continue;
+        auto place = std::find(points.begin(), points.end(), point);
+        if (place == points.end()) place = points.insert(points.end(), point);
+        for (PetscInt d = 0; d < dof; ++d, ++n) {
+          PetscCheck(n < element_size_, PETSC_COMM_SELF, PETSC_ERR_PLIB, "closure larger than the element");
+          cell_dofs_[c * element_size_ + n] = offset + d;
+          if (c == 0) {
+            dof_point_.push_back(static_cast<PetscInt>(place - points.begin()));
+            dof_field_.push_back(f);
+          }
+        }
+      }
+    PetscCall(DMPlexRestoreTransitiveClosure(dm_, first_cell_ + c, PETSC_TRUE, &n_closure, &closure));
+    PetscCheck(n == element_size_, PETSC_COMM_SELF, PETSC_ERR_PLIB, "closure smaller than the element");
+    points_per_cell_ = static_cast<PetscInt>(points.size());
+    cell_points_.insert(cell_points_.end(), points.begin(), points.end());
+  }
+
+  // where J is watched: the quadrature points, then the corners of the reference cell
+  PetscFE fe;
+  PetscQuadrature rule;
+  PetscInt Nq;
+  const PetscReal *xi, *weights;
+  PetscTabulation T;
+  PetscCall(PetscDSGetDiscretization(ds_, 0, (PetscObject *)&fe));
+  PetscCall(PetscFEGetQuadrature(fe, &rule));
+  PetscCall(PetscQuadratureGetData(rule, nullptr, nullptr, &Nq, &xi, &weights));
+  std::vector<PetscReal> samples(xi, xi + 3 * Nq);
+  samples.insert(samples.end(), {-1, -1, -1, 1, -1, -1, -1, 1, -1, -1, -1, 1});
+  sample_points_ = Nq + 4;
+  sample_weights_.assign(weights, weights + Nq);
+  const PetscReal total = std::accumulate(weights, weights + Nq, PetscReal(0));
+  for (PetscReal w : sample_weights_) relative_weights_.push_back(w / total);
+  PetscCall(PetscFECreateTabulation(fe, 1, sample_points_, samples.data(), 1, &T));
+  nodes_ = T->Nb / T->Nc;
+  for (PetscInt q = 0; q < sample_points_; ++q)
+    for (PetscInt a = 0; a < nodes_; ++a)
+      for (PetscInt d = 0; d < 3; ++d)
+        sample_gradients_.push_back(T->T[1][((q * T->Nb + a * T->Nc) * T->Nc) * 3 + d]);
+  PetscCall(PetscTabulationDestroy(&T));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Assembly::setup_facets()
+{
+  PetscInt n_boundaries, face_begin, face_end;
+  PetscFE fe;
+  PetscQuadrature rule;
+  PetscDualSpace space;
+  DM reference;
+  const PetscInt *reference_faces;
+  DMField coordinates;
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscDSGetNumBoundary(ds_, &n_boundaries));
+  PetscCall(DMPlexGetHeightStratum(dm_, 1, &face_begin, &face_end));
+  PetscCall(PetscDSGetDiscretization(ds_, 0, (PetscObject *)&fe));
+  PetscCall(PetscFEGetFaceQuadrature(fe, &rule));
+  PetscCall(PetscFEGetDualSpace(fe, &space));
+  PetscCall(PetscDualSpaceGetDM(space, &reference));
+  PetscCall(DMPlexGetCone(reference, 0, &reference_faces));
+  PetscCall(DMGetCoordinateField(dm_, &coordinates));
+  for (PetscInt b = 0; b < n_boundaries; ++b) {
+    DMBoundaryConditionType type;
+    PetscWeakForm wf;
+    DMLabel label;
+    PetscInt n_values, field;
+    const PetscInt *values;
+    PetscCall(PetscDSGetBoundary(ds_, b, &wf, &type, nullptr, &label, &n_values, &values, &field, nullptr, nullptr,
+                                 nullptr, nullptr, nullptr));
+    if (type != DM_BC_NATURAL) continue;
+    for (PetscInt v = 0; v < n_values; ++v) {
+      ISHandle stratum, faces_is;
+      PetscCall(DMLabelGetStratumIS(label, values[v], stratum.out()));
+      if (!stratum) continue;
+      PetscInt n;
+      const PetscInt *points;
+      std::vector<PetscInt> faces, cells;
+      PetscCall(ISGetLocalSize(stratum, &n));
+      PetscCall(ISGetIndices(stratum, &points));
+      for (PetscInt i = 0; i < n; ++i) {
+        const PetscInt *support;
+        if (points[i] < face_begin || points[i] >= face_end) continue;
+        PetscCall(DMPlexGetSupport(dm_, points[i], &support));
+        faces.push_back(points[i]);
+        cells.push_back(support[0] - first_cell_);
+      }
+      PetscCall(ISRestoreIndices(stratum, &points));
+      if (faces.empty()) continue;
+      auto *facets = new Facets;
+      facets_.push_back(facets);
+      facets->wf = wf;
+      facets->key = {label, values[v], field, 0};
+      facets->cells = cells;
+      PetscCall(ISCreateGeneral(PETSC_COMM_SELF, (PetscInt)faces.size(), faces.data(), PETSC_COPY_VALUES, faces_is.out()));
+      PetscCall(DMFieldCreateFEGeom(coordinates, faces_is, rule, PETSC_TRUE, &facets->geom));
+      // PETSc tabulates on the reference cell's faces but maps coordinates by the face's own orientation: make the
+      // map of the facet that of the reference cell's face, so that x belongs to the basis functions
+      PetscFEGeom &g = *facets->geom;
+      for (std::size_t i = 0; i < cells.size(); ++i) {
+        PetscReal v0[3], R[9], inverse[9], det;
+        PetscReal *x = g.v + i * g.numPoints * 3, *J = g.J + i * g.numPoints * 9;
+        const PetscReal *cell_J = &J_[9 * cells[i]], *cell_v = &v0_[3 * cells[i]], origin[2] = {-1, -1};
+        PetscCall(DMPlexComputeCellGeometryFEM(reference, reference_faces[g.face[i][0]], nullptr, v0, R, inverse, &det));
+        for (int r = 0; r < 3; ++r) {
+          x[r] = cell_v[r];
+          for (int d = 0; d < 3; ++d) {
+            PetscReal xi = v0[d] + 1; // the first rule point, seen from the corner (-1, -1, -1)
+            for (int e = 0; e < 2; ++e) xi += R[3 * d + e] * ((g.xi ? g.xi[e] : -1) - origin[e]);
+            x[r] += cell_J[3 * r + d] * xi;
+          }
+          for (int e = 0; e < 2; ++e)
+            J[3 * r + e] = cell_J[3 * r] * R[e] + cell_J[3 * r + 1] * R[3 + e] + cell_J[3 * r + 2] * R[6 + e];
+        }
+      }
+    }
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+void Assembly::gather(PetscInt cell, const ReadArray &x, PetscScalar *coefficients) const
+{
+  const PetscInt *dofs = cell_dofs(cell);
+  for (PetscInt i = 0; i < element_size_; ++i) coefficients[i] = x[dofs[i]];
+}
+
+PetscFEGeom Assembly::block_geometry(PetscInt begin, PetscInt n)
+{
+  static const PetscReal corner[3] = {-1, -1, -1};
+  PetscFEGeom geom{};
+  geom.xi = corner;
+  geom.v = &v0_[3 * begin];
+  geom.J = &J_[9 * begin];
+  geom.invJ = &invJ_[9 * begin];
+  geom.detJ = &detJ_[begin];
+  geom.dim = geom.dimEmbed = 3;
+  geom.numCells = n;
+  geom.numPoints = 1;
+  geom.isAffine = PETSC_TRUE;
+  return geom;
+}
+
+PetscErrorCode Assembly::residual(PetscReal t, Vec x, Vec x_t, const PetscReal row_scale[], Vec F)
+{
+  const std::size_t size = static_cast<std::size_t>(block_cells * element_size_);
+  std::vector<PetscScalar> u(size), u_t(size), vectors(size);
+
+  PetscFunctionBeginUser;
+  const ReadArray xs(x), xts(x_t);
+  WriteArray f(F);
+  const auto scatter = [&](PetscInt cell, const PetscScalar *vector) {
+    const PetscInt *dofs = cell_dofs(cell);
+    for (PetscInt i = 0; i < element_size_; ++i) f[dofs[i]] += row_scale[dof_field_[i]] * vector[i];
+  };
+
+  for (PetscInt begin = 0, block = 0; begin < cells_; begin += block_cells, ++block) {
+    const PetscInt n = std::min(block_cells, cells_ - begin);
+    PetscFEGeom geom = block_geometry(begin, n);
+    for (PetscInt c = 0; c < n; ++c) {
+      gather(begin + c, xs, &u[c * element_size_]);
+      gather(begin + c, xts, &u_t[c * element_size_]);
+    }
+    std::fill(vectors.begin(), vectors.end(), 0.0);
+    log_.timing = block % timed_share == 0;
+    for (PetscInt field = 0; field < n_fields_; ++field)
+      PetscCall(PetscFEIntegrateResidual(ds_, {nullptr, 0, field, 0}, n, &geom, u.data(), u_t.data(), nullptr, nullptr, t,
+                                         vectors.data()));
+    for (PetscInt c = 0; c < n; ++c) scatter(begin + c, &vectors[c * element_size_]);
+  }
+  log_.timing = false;
+  for (const Facets *facets : facets_) {
+    const auto total = static_cast<PetscInt>(facets->cells.size());
+    for (PetscInt begin = 0; begin < total; begin += block_cells) {
+      const PetscInt n = std::min(block_cells, total - begin);
+      PetscFEGeom *chunk = nullptr;
+      for (PetscInt i = 0; i < n; ++i) {
+        gather(facets->cells[begin + i], xs, &u[i * element_size_]);
+        gather(facets->cells[begin + i], xts, &u_t[i * element_size_]);
+      }
+      std::fill(vectors.begin(), vectors.end(), 0.0);
+      PetscCall(PetscFEGeomGetChunk(facets->geom, begin, begin + n, &chunk));
+      PetscCall(PetscFEIntegrateBdResidual(ds_, facets->wf, facets->key, n, chunk, u.data(), u_t.data(), nullptr, nullptr, t,
+                                           vectors.data()));
+      PetscCall(PetscFEGeomRestoreChunk(facets->geom, begin, begin + n, &chunk));
+      for (PetscInt i = 0; i < n; ++i) scatter(facets->cells[begin + i], &vectors[i * element_size_]);
+    }
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Assembly::jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[], Mat A)
+{
+  const std::size_t size = static_cast<std::size_t>(block_cells * element_size_);
+  std::vector<PetscScalar> u(size), u_t(size), matrices(size * element_size_);
+
+  PetscFunctionBeginUser;
+  const ReadArray xs(x), xts(x_t);
+  PetscCall(map_matrix(A));
+  PetscCall(MatZeroEntries(A));
+  std::fill(map_->ghost_values.begin(), map_->ghost_values.end(), 0.0);
+  if (map_->diagonal) PetscCall(MatSeqAIJGetArray(map_->diagonal, &map_->values[0]));
+  if (map_->off_diagonal) PetscCall(MatSeqAIJGetArray(map_->off_diagonal, &map_->values[1]));
+  for (PetscInt begin = 0, block = 0; begin < cells_; begin += block_cells, ++block) {
+    const PetscInt n = std::min(block_cells, cells_ - begin);
+    PetscFEGeom geom = block_geometry(begin, n);
+    for (PetscInt c = 0; c < n; ++c) {
+      gather(begin + c, xs, &u[c * element_size_]);
+      gather(begin + c, xts, &u_t[c * element_size_]);
+    }
+    std::fill(matrices.begin(), matrices.end(), 0.0);
+    log_.timing = block % timed_share == 0;
+    for (PetscInt pair = 0; pair < n_fields_ * n_fields_; ++pair)
+      PetscCall(PetscFEIntegrateJacobian(ds_, PETSCFE_JACOBIAN, {nullptr, 0, pair, 0}, n, &geom, u.data(), u_t.data(),
+                                         nullptr, nullptr, t, shift, matrices.data()));
+    for (PetscInt c = 0; c < n; ++c)
+      PetscCall(add_to_matrix(begin + c, &matrices[c * element_size_ * element_size_], row_scale, A));
+  }
+  log_.timing = false;
+  for (const Facets *facets : facets_) {
+    const auto total = static_cast<PetscInt>(facets->cells.size());
+    for (PetscInt begin = 0; begin < total; begin += block_cells) {
+      const PetscInt n = std::min(block_cells, total - begin);
+      PetscFEGeom *chunk = nullptr;
+      for (PetscInt i = 0; i < n; ++i) {
+        gather(facets->cells[begin + i], xs, &u[i * element_size_]);
+        gather(facets->cells[begin + i], xts, &u_t[i * element_size_]);
+      }
+      std::fill(matrices.begin(), matrices.end(), 0.0);
+      PetscCall(PetscFEGeomGetChunk(facets->geom, begin, begin + n, &chunk));
+      for (PetscInt trial = 0; trial < n_fields_; ++trial) {
+        PetscFormKey key = facets->key;
+        key.field = facets->key.field * n_fields_ + trial;
+        PetscCall(PetscFEIntegrateBdJacobian(ds_, facets->wf, key, n, chunk, u.data(), u_t.data(), nullptr, nullptr, t, shift,
+                                             matrices.data()));
+      }
+      PetscCall(PetscFEGeomRestoreChunk(facets->geom, begin, begin + n, &chunk));
+      for (PetscInt i = 0; i < n; ++i)
+        PetscCall(add_to_matrix(facets->cells[begin + i], &matrices[i * element_size_ * element_size_], row_scale, A));
+    }
+  }
+  if (map_->diagonal) PetscCall(MatSeqAIJRestoreArray(map_->diagonal, &map_->values[0]));
+  if (map_->off_diagonal) PetscCall(MatSeqAIJRestoreArray(map_->off_diagonal, &map_->values[1]));
+  for (std::size_t r = 0; r < map_->ghost_rows.size(); ++r) {
+    const PetscInt n = map_->ghost_begin[r + 1] - map_->ghost_begin[r];
+    PetscCall(MatSetValues(A, 1, &map_->ghost_rows[r], n, &map_->ghost_columns[map_->ghost_begin[r]],
+                           &map_->ghost_values[map_->ghost_begin[r]], ADD_VALUES));
+  }
+  PetscCall(MatAssemblyBegin(A, MAT_FINAL_ASSEMBLY));
+  PetscCall(MatAssemblyEnd(A, MAT_FINAL_ASSEMBLY));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Assembly::map_matrix(Mat A)
+{
+  PetscSection section, global;
+  PetscInt point_begin, point_end, n_local, row_begin, row_end;
+  PetscBool seq, mpi;
+  const PetscInt *garray = nullptr, *columns[2] = {nullptr, nullptr};
+  PetscInt n_garray = 0;
+
+  PetscFunctionBeginUser;
+  if (map_ && map_->matrix == A) PetscFunctionReturn(PETSC_SUCCESS);
+  delete map_;
+  map_ = new MatrixMap;
+  MatrixMap &m = *map_;
+  m.matrix = A;
+  PetscCall(DMGetLocalSection(dm_, &section));
+  PetscCall(DMGetGlobalSection(dm_, &global));
+  PetscCall(PetscSectionGetChart(section, &point_begin, &point_end));
+  PetscCall(PetscSectionGetStorageSize(section, &n_local));
+  PetscCall(MatGetOwnershipRange(A, &row_begin, &row_end));
+  PetscCall(PetscObjectTypeCompare((PetscObject)A, MATSEQAIJ, &seq));
+  PetscCall(PetscObjectTypeCompare((PetscObject)A, MATMPIAIJ, &mpi));
+  m.direct = seq || mpi;
+
+  // free dofs and their global numbers
+  m.global.assign(n_local, -1);
+  m.row.assign(n_local, 0);
+  m.free_index.assign(n_local, -1);
+  m.owned.assign(point_end, 0);
+  std::vector<PetscInt> first_free(point_end, 0), n_free(point_end, 0); // global number of the first, count
+  for (PetscInt p = point_begin; p < point_end; ++p) {
+    PetscInt dof, offset, constrained, first, k = 0;
+    const PetscInt *which = nullptr;
+    PetscCall(PetscSectionGetDof(section, p, &dof));
+    if (dof == 0) continue;
+    PetscCall(PetscSectionGetOffset(section, p, &offset));
+    PetscCall(PetscSectionGetConstraintDof(section, p, &constrained));
+    if (constrained) PetscCall(PetscSectionGetConstraintIndices(section, p, &which));
+    PetscCall(PetscSectionGetOffset(global, p, &first));
+    m.owned[p] = first >= 0;
+    if (first < 0) first = -(first + 1);
+    first_free[p] = first;
+    for (PetscInt d = 0; d < dof; ++d) {
+      if (std::find(which, which + constrained, d) != which + constrained) continue;
+      m.free_index[offset + d] = static_cast<std::int8_t>(k);
+      m.global[offset + d] = first + k;
+      m.row[offset + d] = first + k - row_begin;
+      ++k;
+    }
+    n_free[p] = k;
+  }
+  if (!m.direct) PetscFunctionReturn(PETSC_SUCCESS);
+
+  m.diagonal = A;
+  if (mpi) {
+    PetscCall(MatMPIAIJGetSeqAIJ(A, &m.diagonal, &m.off_diagonal, &garray));
+    PetscCall(MatGetSize(m.off_diagonal, nullptr, &n_garray));
+  }
+  PetscInt n_rows;
+  PetscBool done;
+  PetscCall(MatGetRowIJ(m.diagonal, 0, PETSC_FALSE, PETSC_FALSE, &n_rows, &m.row_begin[0], &columns[0], &done));
+  if (mpi)
+    PetscCall(MatGetRowIJ(m.off_diagonal, 0, PETSC_FALSE, PETSC_FALSE, &n_rows, &m.row_begin[1], &columns[1], &done));
+
+  // ghost rows: their columns are the free dofs of all mesh points that share a cell with them
+  std::map<PetscInt, std::map<PetscInt, std::int32_t>> ghosts; // row point -> column point -> offset in the row
+  for (PetscInt c = 0; c < cells_; ++c) {
+    const PetscInt *points = &cell_points_[c * points_per_cell_];
+    for (PetscInt i = 0; i < points_per_cell_; ++i)
+      if (!m.owned[points[i]])
+        for (PetscInt j = 0; j < points_per_cell_; ++j) ghosts[points[i]][points[j]] = 0;
+  }
+  m.ghost_begin.push_back(0);
+  for (auto &[point, row] : ghosts) {
+    PetscInt offset, dof, length = 0;
+    std::vector<PetscInt> row_columns;
+    for (auto &[column, place] : row) {
+      place = static_cast<std::int32_t>(length);
+      for (PetscInt k = 0; k < n_free[column]; ++k) row_columns.push_back(first_free[column] + k);
+      length += n_free[column];
+    }
+    PetscCall(PetscSectionGetOffset(section, point, &offset));
+    PetscCall(PetscSectionGetDof(section, point, &dof));
+    for (PetscInt d = 0; d < dof; ++d) {
+      if (m.free_index[offset + d] < 0) continue;
+      m.row[offset + d] = -static_cast<PetscInt>(m.ghost_rows.size()) - 1;
+      m.ghost_rows.push_back(m.global[offset + d]);
+      m.ghost_columns.insert(m.ghost_columns.end(), row_columns.begin(), row_columns.end());
+      m.ghost_begin.push_back(static_cast<PetscInt>(m.ghost_columns.size()));
+    }
+  }
+  m.ghost_values.assign(m.ghost_columns.size(), 0);
+
+  // offsets of column points within the rows of row points
+  m.offset.resize(static_cast<std::size_t>(cells_) * points_per_cell_ * points_per_cell_);
+  for (PetscInt c = 0; c < cells_; ++c) {
+    const PetscInt *points = &cell_points_[c * points_per_cell_];
+    for (PetscInt i = 0; i < points_per_cell_; ++i) {
+      for (PetscInt j = 0; j < points_per_cell_; ++j) {
+        std::int32_t &offset = m.offset[(c * points_per_cell_ + i) * points_per_cell_ + j];
+        offset = 0;
+        if (n_free[points[i]] == 0 || n_free[points[j]] == 0) continue;
+        if (!m.owned[points[i]]) {
+          offset = ghosts[points[i]][points[j]];
+          continue;
+        }
+        const int part = m.owned[points[j]] ? 0 : 1;
+        PetscInt column = first_free[points[j]];
+        if (part == 0) column -= row_begin;
+        else {
+          const PetscInt *place = std::lower_bound(garray, garray + n_garray, column);
+          PetscCheck(place < garray + n_garray && *place == column, PETSC_COMM_SELF, PETSC_ERR_PLIB,
+                     "the matrix lacks a column of a neighbouring rank");
+          column = static_cast<PetscInt>(place - garray);
+        }
+        const PetscInt row = first_free[points[i]] - row_begin;
+        const PetscInt *begin = columns[part] + m.row_begin[part][row], *end = columns[part] + m.row_begin[part][row + 1];
+        const PetscInt *place = std::lower_bound(begin, end, column);
+        PetscCheck(place < end && *place == column, PETSC_COMM_SELF, PETSC_ERR_PLIB,
+                   "the matrix pattern lacks an entry of the element matrices");
+        offset = static_cast<std::int32_t>(place - begin);
+      }
+    }
+  }
+  PetscCall(MatRestoreRowIJ(m.diagonal, 0, PETSC_FALSE, PETSC_FALSE, &n_rows, nullptr, nullptr, &done));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Assembly::add_to_matrix(PetscInt cell, const PetscScalar *matrix, const PetscReal row_scale[], Mat A)
+{
+  constexpr PetscInt max_size = 128;
+  MatrixMap &m = *map_;
+  const PetscInt *dofs = cell_dofs(cell), *points = &cell_points_[cell * points_per_cell_];
+
+  PetscFunctionBeginHot;
+  PetscCheck(element_size_ <= max_size, PETSC_COMM_SELF, PETSC_ERR_SUP, "elements with more than %d dofs", (int)max_size);
+  if (!m.direct) {
+    PetscScalar scaled[max_size];
+    PetscInt columns[max_size];
+    for (PetscInt i = 0; i < element_size_; ++i) columns[i] = m.global[dofs[i]];
+    for (PetscInt i = 0; i < element_size_; ++i) {
+      for (PetscInt j = 0; j < element_size_; ++j) scaled[j] = row_scale[dof_field_[i]] * matrix[i * element_size_ + j];
+      PetscCall(MatSetValues(A, 1, &columns[i], element_size_, columns, scaled, ADD_VALUES));
+    }
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+  // free columns, first those of this rank, then the others
+  PetscInt columns[max_size], n_columns[2] = {0, 0};
+  for (int part = 0, n = 0; part < 2; ++part) {
+    for (PetscInt j = 0; j < element_size_; ++j)
+      if (m.free_index[dofs[j]] >= 0 && (m.owned[points[dof_point_[j]]] ? 0 : 1) == part) columns[n++] = j;
+    n_columns[part] = n;
+  }
+  PetscInt place[max_size], current = -1;
+  for (PetscInt i = 0; i < element_size_; ++i) {
+    if (m.free_index[dofs[i]] < 0) continue;
+    const PetscInt point = dof_point_[i];
+    if (point != current) {
+      const std::int32_t *offset = &m.offset[(cell * points_per_cell_ + point) * points_per_cell_];
+      for (PetscInt k = 0; k < n_columns[1]; ++k) {
+        const PetscInt j = columns[k];
+        place[k] = offset[dof_point_[j]] + m.free_index[dofs[j]];
+      }
+      current = point;
+    }
+    const PetscScalar *entries = matrix + i * element_size_, scale = row_scale[dof_field_[i]];
+    const PetscInt row = m.row[dofs[i]];
+    if (row < 0) {
+      PetscScalar *target = &m.ghost_values[m.ghost_begin[-row - 1]];
+      for (PetscInt k = 0; k < n_columns[1]; ++k) target[place[k]] += scale * entries[columns[k]];
+    } else {
+      PetscScalar *target = m.values[0] + m.row_begin[0][row];
+      for (PetscInt k = 0; k < n_columns[0]; ++k) target[place[k]] += scale * entries[columns[k]];
+      if (n_columns[1] > n_columns[0]) {
+        target = m.values[1] + m.row_begin[1][row];
+        for (PetscInt k = n_columns[0]; k < n_columns[1]; ++k) target[place[k]] += scale * entries[columns[k]];
+      }
+    }
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Grad u at sample point @p q of cell @p c from the cell's displacements.
+static void sample_gradient(const PetscReal *D, const PetscReal *inverse, PetscInt nodes, const PetscScalar *u, PetscScalar H[9])
+{
+  PetscScalar A[9] = {0};
+  for (PetscInt a = 0; a < nodes; ++a)
+    for (int i = 0; i < 3; ++i)
+      for (int g = 0; g < 3; ++g) A[3 * i + g] += u[3 * a + i] * D[3 * a + g];
+  for (int i = 0; i < 3; ++i)
+    for (int d = 0; d < 3; ++d)
+      H[3 * i + d] = A[3 * i] * inverse[d] + A[3 * i + 1] * inverse[3 + d] + A[3 * i + 2] * inverse[6 + d];
+}
+
+void Assembly::point_states(PetscInt c, const PetscScalar *x, std::vector<PointState> &states) const
+{
+  std::vector<PetscScalar> u(3 * nodes_);
+  states.resize(sample_points_);
+  for (PetscInt i = 0; i < 3 * nodes_; ++i) u[i] = x[cell_dofs(c)[i]];
+  for (PetscInt q = 0; q < sample_points_; ++q) {
+    PetscScalar H[9];
+    sample_gradient(&sample_gradients_[q * nodes_ * 3], &invJ_[9 * c], nodes_, u.data(), H);
+    make_point_state(H, nullptr, states[q]);
+  }
+}
+
+PetscErrorCode Assembly::measure(Vec x, Measures &measures) const
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)dm_);
+  const auto n_rule = static_cast<PetscInt>(sample_weights_.size());
+  struct {
+    double value;
+    int rank;
+  } least{PETSC_MAX_REAL, 0}, winner;
+  double volume = 0, extremes[2] = {-PETSC_MAX_REAL, -PETSC_MAX_REAL}; // max J, -(min J at points)
+  PetscInt where = -1;
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Comm_rank(comm, &least.rank));
+  const ReadArray xs(x);
+  for (PetscInt c = 0; c < cells_; ++c) {
+    const PetscInt *dofs = cell_dofs(c);
+    PetscScalar u[3 * 32];
+    for (PetscInt i = 0; i < 3 * nodes_; ++i) u[i] = xs[dofs[i]];
+    double sum = 0;
+    for (PetscInt q = 0; q < sample_points_; ++q) {
+      PetscScalar H[9];
+      sample_gradient(&sample_gradients_[q * nodes_ * 3], &invJ_[9 * c], nodes_, u, H);
+      const double Jm1 = jacobian_minus_one(H), J = 1 + Jm1;
+      extremes[0] = std::max(extremes[0], J);
+      if (q < n_rule) {
+        sum += sample_weights_[q] * Jm1;
+        extremes[1] = std::max(extremes[1], -J);
+      }
+      if (!(J >= least.value)) { // also taken when J is not a number
+        least.value = std::isnan(J) ? -PETSC_MAX_REAL : J;
+        where = c;
+      }
+    }
+    volume += sum * detJ_[c];
+  }
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &volume, 1, MPI_DOUBLE, MPI_SUM, comm));
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, extremes, 2, MPI_DOUBLE, MPI_MAX, comm));
+  PetscCallMPI(MPI_Allreduce(&least, &winner, 1, MPI_DOUBLE_INT, MPI_MINLOC, comm));
+  measures.volume_change = volume;
+  measures.max_J = extremes[0];
+  measures.min_J_points = -extremes[1];
+  measures.min_J = winner.value;
+  measures.rank = winner.rank;
+  measures.cell = where;
+  if (winner.rank == least.rank && where >= 0)
+    for (int d = 0; d < 3; ++d) // reference coordinates of the centroid are -1/2
+      measures.where[d] = v0_[3 * where + d] + (J_[9 * where + 3 * d] + J_[9 * where + 3 * d + 1] + J_[9 * where + 3 * d + 2]) / 2;
+  PetscCallMPI(MPI_Bcast(measures.where, 3, MPIU_REAL, winner.rank, comm));
+  PetscCallMPI(MPI_Bcast(&measures.cell, 1, MPIU_INT, winner.rank, comm));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace pulmo

@@ -1,0 +1,40 @@
+# Finds PETSc through PETSC_DIR (and PETSC_ARCH), else through pkg-config, and checks what pulmo needs of it.
+# Defines the target PETSc::PETSc.
+find_package(PkgConfig REQUIRED)
+
+if(NOT PETSC_DIR AND DEFINED ENV{PETSC_DIR})
+  set(PETSC_DIR $ENV{PETSC_DIR})
+endif()
+if(NOT PETSC_ARCH AND DEFINED ENV{PETSC_ARCH})
+  set(PETSC_ARCH $ENV{PETSC_ARCH})
+endif()
+if(PETSC_DIR)
+  set(ENV{PKG_CONFIG_PATH} "${PETSC_DIR}/${PETSC_ARCH}/lib/pkgconfig:${PETSC_DIR}/lib/pkgconfig:$ENV{PKG_CONFIG_PATH}")
+endif()
+
+pkg_search_module(PETSC QUIET IMPORTED_TARGET PETSc petsc)
+if(NOT PETSC_FOUND)
+  message(FATAL_ERROR "PETSc was not found: install petsc-dev (tools/setup does), or set PETSC_DIR and PETSC_ARCH.")
+endif()
+if(PETSC_VERSION VERSION_LESS 3.18)
+  message(FATAL_ERROR "pulmo needs PETSc 3.18 or newer, found ${PETSC_VERSION}.")
+endif()
+
+find_file(PETSC_CONF petscconf.h HINTS ${PETSC_INCLUDE_DIRS} NO_DEFAULT_PATH)
+file(READ "${PETSC_CONF}" PETSC_CONF_TEXT)
+foreach(package HYPRE MUMPS HDF5)
+  if(NOT PETSC_CONF_TEXT MATCHES "PETSC_HAVE_${package} 1")
+    message(FATAL_ERROR "This PETSc (${PETSC_VERSION}) was built without ${package}; pulmo needs it. "
+                        "Take Debian's petsc-dev or configure PETSc with --download-${package}.")
+  endif()
+endforeach()
+if(PETSC_CONF_TEXT MATCHES "PETSC_USE_COMPLEX 1" OR NOT PETSC_CONF_TEXT MATCHES "PETSC_USE_REAL_DOUBLE 1")
+  message(FATAL_ERROR "pulmo needs a PETSc with real double-precision scalars.")
+endif()
+find_path(PETSC_PRIVATE_HEADERS petsc/private/petscfeimpl.h HINTS ${PETSC_INCLUDE_DIRS} NO_DEFAULT_PATH)
+if(NOT PETSC_PRIVATE_HEADERS)
+  message(FATAL_ERROR "PETSc's petsc/private headers are missing; pulmo's element type needs them.")
+endif()
+
+add_library(PETSc::PETSc ALIAS PkgConfig::PETSC)
+message(STATUS "PETSc ${PETSC_VERSION} with hypre, MUMPS and HDF5")

@@ -1,0 +1,302 @@
+// Field snapshots: HDF5 through PETSc's viewer, one XDMF index with quadratic tetrahedra.
+#include "pulmo/output.hpp"
+
+#include <array>
+#include <cmath>
+#include <filesystem>
+#include <fstream>
+
+namespace pulmo {
+
+namespace {
+
+/// Edges of a quadratic tetrahedron in the order of VTK and XDMF.
+constexpr std::array<std::array<int, 2>, 6> edges{{{0, 1}, {1, 2}, {0, 2}, {0, 3}, {1, 3}, {2, 3}}};
+
+/// Writes a block of values as dataset @p name, @p components per entry.
+PetscErrorCode write_values(PetscViewer viewer, const char *name, PetscInt components, const std::vector<PetscScalar> &values)
+{
+  VecHandle v;
+  const MPI_Comm comm = PetscObjectComm((PetscObject)viewer);
+
+  PetscFunctionBeginUser;
+  PetscCall(VecCreateMPIWithArray(comm, components, (PetscInt)values.size(), PETSC_DETERMINE, values.data(), v.out()));
+  PetscCall(PetscObjectSetName((PetscObject)(Vec)v, name));
+  PetscCall(VecView(v, viewer));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Opens @p file under a temporary name; close_whole() gives it its own.
+PetscErrorCode open_part(MPI_Comm comm, const std::string &file, ViewerHandle &viewer)
+{
+  PetscFunctionBeginUser;
+  PetscCall(PetscViewerCreate(comm, viewer.out()));
+  PetscCall(PetscViewerSetType(viewer, PETSCVIEWERHDF5));
+  PetscCall(PetscViewerFileSetMode(viewer, FILE_MODE_WRITE));
+  PetscCall(PetscViewerFileSetName(viewer, (file + ".part").c_str()));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode close_whole(MPI_Comm comm, const std::string &file, ViewerHandle &viewer)
+{
+  PetscMPIInt rank;
+  int renamed = 1;
+
+  PetscFunctionBeginUser;
+  viewer.reset();
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  if (rank == 0) {
+    std::error_code error;
+    std::filesystem::rename(file + ".part", file, error);
+    renamed = !error;
+  }
+  PetscCallMPI(MPI_Bcast(&renamed, 1, MPI_INT, 0, comm));
+  PulmoUserCheck(renamed, comm, "cannot write %s; free the disk or choose another -output_dir", file.c_str());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+std::string snapshot_name(std::size_t index)
+{
+  char name[32];
+  std::snprintf(name, sizeof(name), "fields_%05zu.h5", index);
+  return name;
+}
+
+} // namespace
+
+PetscErrorCode FieldWriter::observe(const StepReport &step)
+{
+  const PetscReal every = output_.fields_every();
+  const bool start = step.row.dt == 0;
+
+  PetscFunctionBeginUser;
+  if (every > 0) {
+    if (step.row.time < next_ - 1e-9 * every) PetscFunctionReturn(PETSC_SUCCESS);
+    next_ = (std::floor(step.row.time / every + 1e-9) + 1) * every;
+  } else if (!start && !step.phase_ends) {
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+  PetscCall(snapshot(step.row.time, step.local));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Nodes are vertices and edges; each rank numbers those it owns, then tells the others.
+PetscErrorCode FieldWriter::number_nodes()
+{
+  const DM dm = model_.dm();
+  const MPI_Comm comm = PetscObjectComm((PetscObject)dm);
+  PetscInt begin, end, first = 0, roots, n_leaves;
+  const PetscInt *leaves;
+  PetscSF sf;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMPlexGetChart(dm, &begin, &end));
+  PetscCall(DMGetPointSF(dm, &sf));
+  PetscCall(PetscSFGetGraph(sf, &roots, &n_leaves, &leaves, nullptr));
+  std::vector<char> foreign(static_cast<std::size_t>(end), 0);
+  for (PetscInt i = 0; roots >= 0 && i < n_leaves; ++i) foreign[leaves ? leaves[i] : i] = 1;
+  for (PetscInt depth = 0; depth < 2; ++depth) {
+    PetscInt a, b;
+    PetscCall(DMPlexGetDepthStratum(dm, depth, &a, &b));
+    for (PetscInt p = a; p < b; ++p)
+      if (!foreign[p]) nodes_.push_back(p);
+  }
+  const auto mine = static_cast<PetscInt>(nodes_.size());
+  PetscCallMPI(MPI_Exscan(&mine, &first, 1, MPIU_INT, MPI_SUM, comm));
+  PetscMPIInt rank;
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  if (rank == 0) first = 0;
+  PetscCallMPI(MPI_Allreduce(&mine, &n_nodes_, 1, MPIU_INT, MPI_SUM, comm));
+  node_number_.assign(static_cast<std::size_t>(end), -1);
+  for (PetscInt i = 0; i < mine; ++i) node_number_[nodes_[i]] = first + i;
+  if (roots >= 0) {
+    std::vector<PetscInt> owned = node_number_;
+    PetscCall(PetscSFBcastBegin(sf, MPIU_INT, owned.data(), node_number_.data(), MPI_REPLACE));
+    PetscCall(PetscSFBcastEnd(sf, MPIU_INT, owned.data(), node_number_.data(), MPI_REPLACE));
+  }
+  n_cells_ = scene_.mesh().cells();
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode FieldWriter::write_mesh()
+{
+  const DM dm = model_.dm();
+  const MPI_Comm comm = PetscObjectComm((PetscObject)dm);
+  PetscInt vertex_begin, vertex_end, cell_begin, cell_end, edge_begin, edge_end;
+  std::vector<PetscScalar> geometry;
+  std::vector<PetscInt> topology;
+  ViewerHandle viewer;
+  ISHandle cells;
+
+  PetscFunctionBeginUser;
+  PetscCall(number_nodes());
+  PetscCall(DMPlexGetDepthStratum(dm, 0, &vertex_begin, &vertex_end));
+  PetscCall(DMPlexGetDepthStratum(dm, 1, &edge_begin, &edge_end));
+  PetscCall(DMPlexGetHeightStratum(dm, 0, &cell_begin, &cell_end));
+  for (PetscInt p : nodes_) {
+    PetscReal x[3];
+    PetscCall(scene_.mesh().node_coordinates(p, x));
+    geometry.insert(geometry.end(), x, x + 3);
+  }
+  for (PetscInt c = cell_begin; c < cell_end; ++c) {
+    PetscInt *closure = nullptr, n;
+    std::vector<PetscInt> corners;
+    PetscCall(DMPlexGetTransitiveClosure(dm, c, PETSC_TRUE, &n, &closure));
+    for (PetscInt i = 0; i < n; ++i)
+      if (closure[2 * i] >= vertex_begin && closure[2 * i] < vertex_end) corners.push_back(closure[2 * i]);
+    PetscCall(DMPlexRestoreTransitiveClosure(dm, c, PETSC_TRUE, &n, &closure));
+    std::swap(corners[0], corners[1]); // DMPlex counts the base the other way round than VTK
+    for (PetscInt v : corners) topology.push_back(node_number_[v]);
+    for (const auto &edge : edges) {
+      const PetscInt ends[2] = {corners[edge[0]], corners[edge[1]]}, *join = nullptr;
+      PetscInt n_join;
+      PetscCall(DMPlexGetJoin(dm, 2, ends, &n_join, &join));
+      PetscCheck(n_join == 1, PETSC_COMM_SELF, PETSC_ERR_PLIB, "two vertices of a cell do not share one edge");
+      topology.push_back(node_number_[join[0]]);
+      PetscCall(DMPlexRestoreJoin(dm, 2, ends, &n_join, &join));
+    }
+  }
+  const std::string file = output_.path("fields.h5");
+  PetscCall(open_part(comm, file, viewer));
+  PetscCall(write_values(viewer, "geometry", 3, geometry));
+  PetscCall(ISCreateGeneral(comm, (PetscInt)topology.size(), topology.data(), PETSC_COPY_VALUES, cells.out()));
+  PetscCall(ISSetBlockSize(cells, 10));
+  PetscCall(PetscObjectSetName((PetscObject)(IS)cells, "topology"));
+  PetscCall(ISView(cells, viewer));
+  PetscCall(close_whole(comm, file, viewer));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
+{
+  const DM dm = model_.dm();
+  const MPI_Comm comm = PetscObjectComm((PetscObject)dm);
+  const bool gas = scene_.facts().airflow;
+  const Assembly &assembly = model_.assembly();
+  const TissueLaw &law = scene_.tissue().law();
+  PetscSection section;
+  PetscInt vertex_begin, vertex_end;
+  std::vector<PetscScalar> u, p, J, porosity, hydrostatic, von_mises;
+  ViewerHandle viewer;
+
+  PetscFunctionBeginUser;
+  if (n_nodes_ < 0) PetscCall(write_mesh());
+  const ReadArray x(local);
+  PetscCall(DMGetLocalSection(dm, &section));
+  PetscCall(DMPlexGetDepthStratum(dm, 0, &vertex_begin, &vertex_end));
+  for (PetscInt node : nodes_) {
+    PetscInt offset;
+    PetscCall(PetscSectionGetFieldOffset(section, node, displacement, &offset));
+    for (int d = 0; d < 3; ++d) u.push_back(x[offset + d]);
+    if (!gas) continue;
+    const PetscInt *ends = &node;
+    PetscInt n = 1;
+    PetscScalar mean = 0;
+    if (node < vertex_begin || node >= vertex_end) {
+      PetscCall(DMPlexGetCone(dm, node, &ends));
+      PetscCall(DMPlexGetConeSize(dm, node, &n));
+    }
+    for (PetscInt i = 0; i < n; ++i) {
+      PetscCall(PetscSectionGetFieldOffset(section, ends[i], pressure, &offset));
+      mean += x[offset] / n;
+    }
+    p.push_back(mean);
+  }
+  // cell means over the quadrature points
+  std::vector<PointState> states;
+  for (PetscInt c = 0; c < assembly.cells(); ++c) {
+    assembly.point_states(c, x.data(), states);
+    PetscScalar mean_J = 0, mean_h = 0, mean_m = 0;
+    const auto &weights = assembly.relative_weights();
+    for (std::size_t q = 0; q < weights.size(); ++q) {
+      const PointState &s = states[q];
+      PetscScalar P[9], sigma[9];
+      law.stress(s, P);
+      for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) // Cauchy: P F^T / J
+          sigma[3 * i + j] = (P[3 * i] * s.F[3 * j] + P[3 * i + 1] * s.F[3 * j + 1] + P[3 * i + 2] * s.F[3 * j + 2]) / s.J;
+      const PetscScalar h = (sigma[0] + sigma[4] + sigma[8]) / 3;
+      PetscScalar deviator[9];
+      for (int i = 0; i < 9; ++i) deviator[i] = sigma[i] - (i % 4 == 0 ? h : 0);
+      mean_J += weights[q] * s.J;
+      mean_h += weights[q] * h;
+      mean_m += weights[q] * std::sqrt(1.5 * contract(deviator, deviator));
+    }
+    J.push_back(mean_J);
+    hydrostatic.push_back(mean_h);
+    von_mises.push_back(mean_m);
+    if (gas) porosity.push_back(1 - (1 - scene_.airflow().porosity()) / mean_J);
+  }
+  const std::string file = output_.path(snapshot_name(times_.size()));
+  PetscCall(open_part(comm, file, viewer));
+  PetscCall(write_values(viewer, "displacement", 3, u));
+  PetscCall(write_values(viewer, "J", 1, J));
+  PetscCall(write_values(viewer, "hydrostatic_stress", 1, hydrostatic));
+  PetscCall(write_values(viewer, "von_mises_stress", 1, von_mises));
+  if (gas) {
+    PetscCall(write_values(viewer, "pressure", 1, p));
+    PetscCall(write_values(viewer, "porosity", 1, porosity));
+  }
+  PetscCall(close_whole(comm, file, viewer));
+  times_.push_back(time);
+  PetscCall(write_index());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode FieldWriter::write_index() const
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)model_.dm());
+  PetscMPIInt rank;
+  int written = 1;
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  if (rank == 0) {
+    const std::string file = output_.path("fields.xdmf"), part = file + ".part";
+    std::ofstream f(part);
+    const auto item = [&](const char *h5, const char *dataset, PetscInt rows, PetscInt columns, const char *type) {
+      f << "<DataItem Format=\"HDF\" NumberType=\"" << type << "\" Precision=\"" << (type[0] == 'I' ? sizeof(PetscInt) : 8)
+        << "\" Dimensions=\"" << rows;
+      if (columns > 1) f << " " << columns;
+      f << "\">" << h5 << ":/" << dataset << "</DataItem>";
+    };
+    f << "<?xml version=\"1.0\"?>\n<Xdmf Version=\"3.0\">\n<Domain>\n"
+      << "<Grid Name=\"lung\" GridType=\"Collection\" CollectionType=\"Temporal\">\n";
+    f.precision(15);
+    for (std::size_t k = 0; k < times_.size(); ++k) {
+      const std::string h5 = snapshot_name(k);
+      const auto attribute = [&](const char *name, const char *centre, PetscInt rows, PetscInt columns) {
+        f << "  <Attribute Name=\"" << name << "\" AttributeType=\"" << (columns == 3 ? "Vector" : "Scalar") << "\" Center=\""
+          << centre << "\">";
+        item(h5.c_str(), name, rows, columns, "Float");
+        f << "</Attribute>\n";
+      };
+      f << " <Grid Name=\"step\" GridType=\"Uniform\">\n  <Time Value=\"" << times_[k]
+        << "\"/>\n  <Topology TopologyType=\"Tetrahedron_10\" NumberOfElements=\"" << n_cells_ << "\">";
+      item("fields.h5", "topology", n_cells_, 10, "Int");
+      f << "</Topology>\n  <Geometry GeometryType=\"XYZ\">";
+      item("fields.h5", "geometry", n_nodes_, 3, "Float");
+      f << "</Geometry>\n";
+      attribute("displacement", "Node", n_nodes_, 3);
+      attribute("J", "Cell", n_cells_, 1);
+      attribute("hydrostatic_stress", "Cell", n_cells_, 1);
+      attribute("von_mises_stress", "Cell", n_cells_, 1);
+      if (scene_.facts().airflow) {
+        attribute("pressure", "Node", n_nodes_, 1);
+        attribute("porosity", "Cell", n_cells_, 1);
+      }
+      f << " </Grid>\n";
+    }
+    f << "</Grid>\n</Domain>\n</Xdmf>\n";
+    f.close();
+    std::error_code error;
+    if (f.good()) std::filesystem::rename(part, file, error);
+    written = f.good() && !error;
+  }
+  PetscCallMPI(MPI_Bcast(&written, 1, MPI_INT, 0, comm));
+  PulmoUserCheck(written, comm, "cannot write %s; free the disk or choose another -output_dir",
+                 output_.path("fields.xdmf").c_str());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace pulmo

@@ -1,0 +1,343 @@
+#include "pulmo/mesh.hpp"
+
+#include "pulmo/units.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <cstdio>
+
+namespace pulmo {
+
+namespace {
+
+/// Cells whose volume is below this share of (longest edge)^3 are degenerate.
+constexpr PetscReal degenerate = 1e-10;
+
+/// Volume outside which a ventilated lung betrays the wrong unit, mm^3 (a mouse's lung at a tenth of the size of
+/// a man's holds 2500 mm^3; the same in metres 2.5e-6 mm^3).
+constexpr PetscReal least_lung = 1e-1, largest_lung = 1e9;
+
+/// Reads the file on rank 0 alone so that an unreadable mesh is one clear error on all ranks.
+PetscErrorCode check_file(MPI_Comm comm, const std::string &file)
+{
+  PetscMPIInt rank;
+  int found = 1, readable = 1;
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  if (rank == 0) {
+    std::FILE *f = std::fopen(file.c_str(), "rb");
+    found = f != nullptr;
+    if (f) {
+      DMHandle trial;
+      char first = 0;
+      found = std::fread(&first, 1, 1, f) == 1;
+      std::fclose(f);
+      PetscCall(PetscPushErrorHandler(PetscReturnErrorHandler, nullptr));
+      readable = found && DMPlexCreateFromFile(PETSC_COMM_SELF, file.c_str(), "pulmo", PETSC_FALSE, trial.out()) == 0;
+      PetscCall(PetscPopErrorHandler());
+    }
+  }
+  PetscCallMPI(MPI_Bcast(&found, 1, MPI_INT, 0, comm));
+  PetscCallMPI(MPI_Bcast(&readable, 1, MPI_INT, 0, comm));
+  PulmoUserCheck(found, comm, "-dm_plex_filename %s: there is no such file, or it is empty", file.c_str());
+  PulmoUserCheck(readable, comm,
+                 "-dm_plex_filename %s is not a readable mesh; pulmo reads gmsh's MSH 2.2 and 4.1 (ASCII or binary)",
+                 file.c_str());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Corner coordinates (4 x 3, mm) of a local tetrahedron.
+PetscErrorCode cell_corners(DM dm, PetscInt cell, PetscScalar x[12])
+{
+  Vec coordinates;
+  PetscSection section;
+  PetscScalar *values = nullptr;
+  PetscInt n;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMGetCoordinatesLocal(dm, &coordinates));
+  PetscCall(DMGetCoordinateSection(dm, &section));
+  PetscCall(DMPlexVecGetClosure(dm, section, coordinates, cell, &n, &values));
+  for (PetscInt i = 0; i < 12; ++i) x[i] = i < n ? values[i] : 0;
+  PetscCall(DMPlexVecRestoreClosure(dm, section, coordinates, cell, &n, &values));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace
+
+PetscErrorCode Mesh::declare(Options &options)
+{
+  PetscFunctionBeginUser;
+  options.group("mesh", "mesh (read from -dm_plex_filename)");
+  PetscCall(options.given("scale", scale_given_));
+  PetscCall(options.real("scale", "-", Range::positive(), "multiplies the coordinates read, to get mm", scale_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Mesh::read(const Options &options, bool ventilated)
+{
+  const MPI_Comm comm = options.comm();
+  char name[PETSC_MAX_PATH_LEN] = "";
+  PetscBool given;
+  PetscInt dim;
+  Vec coordinates;
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscOptionsGetString(nullptr, nullptr, "-dm_plex_filename", name, sizeof(name), &given));
+  PulmoUserCheck(given, comm, "no mesh: give -dm_plex_filename FILE.msh (pulmo's own are in meshes/)");
+  file_ = name;
+  PetscCall(check_file(comm, file_));
+
+  // one label per physical name
+  PetscCall(PetscOptionsSetValue(nullptr, "-dm_plex_gmsh_use_regions", "true"));
+  PetscCall(DMCreate(comm, dm_.out()));
+  PetscCall(DMSetType(dm_, DMPLEX));
+  PetscCall(DMSetFromOptions(dm_));
+  PetscCall(DMViewFromOptions(dm_, nullptr, "-dm_view"));
+  PetscCall(DMGetDimension(dm_, &dim));
+  PulmoUserCheck(dim == 3, comm, "-dm_plex_filename %s holds no volume elements (dimension %d); mesh the volume",
+                 name, static_cast<int>(dim));
+  PetscCall(DMGetCoordinatesLocal(dm_, &coordinates));
+  PetscCall(VecScale(coordinates, scale_));
+  PetscCall(DMGetCoordinates(dm_, &coordinates));
+  PetscCall(VecScale(coordinates, scale_));
+  PetscCall(check_cells(options));
+  PetscCall(find_surfaces(options));
+  if (ventilated && !scale_given_) {
+    PulmoUserCheck(volume_ >= least_lung, comm,
+                   "the mesh %s holds %.3g ml, as if its coordinates were in metres: give -mesh_scale 1000 "
+                   "(or -mesh_scale 1 if that is the size)", name, (double)(volume_ / units::mm3_per_ml));
+    PulmoUserCheck(volume_ <= largest_lung, comm,
+                   "the mesh %s holds %.3g ml, as if its coordinates were in micrometres: give -mesh_scale 0.001 "
+                   "(or -mesh_scale 1 if that is the size)", name, (double)(volume_ / units::mm3_per_ml));
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Mesh::check_cells(const Options &options)
+{
+  const MPI_Comm comm = options.comm();
+  PetscInt begin, end;
+  struct {
+    double share;
+    int rank;
+  } worst{1, 0}, global;
+  PetscReal volume = 0, centre[3] = {0, 0, 0};
+  PetscInt bad = 0, foreign = 0;
+  PetscMPIInt rank;
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  worst.rank = rank;
+  PetscCall(DMPlexGetHeightStratum(dm_, 0, &begin, &end));
+  for (PetscInt c = begin; c < end; ++c) {
+    DMPolytopeType type;
+    PetscScalar x[12];
+    PetscReal J[9], longest = 0;
+    PetscCall(DMPlexGetCellType(dm_, c, &type));
+    if (type != DM_POLYTOPE_TETRAHEDRON) {
+      ++foreign;
+      continue;
+    }
+    PetscCall(cell_corners(dm_, c, x));
+    for (int i = 0; i < 4; ++i)
+      for (int j = 0; j < i; ++j)
+        longest = std::max(longest, std::hypot(x[3 * i] - x[3 * j], x[3 * i + 1] - x[3 * j + 1], x[3 * i + 2] - x[3 * j + 2]));
+    for (int i = 0; i < 3; ++i)
+      for (int d = 0; d < 3; ++d) J[3 * i + d] = x[3 * (i + 1) + d] - x[d];
+    // DMPlex numbers the corners of a tetrahedron so that this determinant is negative for a good cell
+    const PetscReal det = -(J[0] * (J[4] * J[8] - J[5] * J[7]) + J[1] * (J[5] * J[6] - J[3] * J[8]) +
+                            J[2] * (J[3] * J[7] - J[4] * J[6]));
+    const PetscReal share = longest > 0 ? det / (longest * longest * longest) : 0;
+    volume += det / 6;
+    if (!(share > degenerate)) ++bad;
+    if (!(share >= worst.share)) {
+      worst.share = share;
+      for (int d = 0; d < 3; ++d) centre[d] = (x[d] + x[3 + d] + x[6 + d] + x[9 + d]) / 4;
+    }
+  }
+  PetscInt counts[3] = {end - begin, bad, foreign};
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, counts, 3, MPIU_INT, MPI_SUM, comm));
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &volume, 1, MPIU_REAL, MPI_SUM, comm));
+  PetscCallMPI(MPI_Allreduce(&worst, &global, 1, MPI_DOUBLE_INT, MPI_MINLOC, comm));
+  PetscCallMPI(MPI_Bcast(centre, 3, MPIU_REAL, global.rank, comm));
+  cells_ = counts[0];
+  volume_ = volume;
+  PulmoUserCheck(cells_ > 0, comm, "-dm_plex_filename %s holds no cells", file_.c_str());
+  PulmoUserCheck(counts[2] == 0, comm, "-dm_plex_filename %s holds %d cells that are not tetrahedra; mesh with tetrahedra only",
+                 file_.c_str(), static_cast<int>(counts[2]));
+  PulmoUserCheck(counts[1] == 0, comm,
+                 "-dm_plex_filename %s holds %d inverted or degenerate cells, the worst at (%.6g, %.6g, %.6g) mm with "
+                 "volume / (longest edge)^3 = %.2g; mesh anew or optimise the mesh in gmsh",
+                 file_.c_str(), static_cast<int>(counts[1]), (double)centre[0], (double)centre[1], (double)centre[2],
+                 global.share / 6);
+  length_ = std::cbrt(volume_ / static_cast<PetscReal>(cells_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Mesh::find_surfaces(const Options &options)
+{
+  const MPI_Comm comm = options.comm();
+  PetscInt n, face_begin, face_end;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMPlexGetHeightStratum(dm_, 1, &face_begin, &face_end));
+  PetscCall(DMGetNumLabels(dm_, &n));
+  for (PetscInt l = 0; l < n; ++l) {
+    const char *name;
+    DMLabel label;
+    ISHandle values_is;
+    const PetscInt *values;
+    PetscInt n_values, value = -1, faces = 0, interior = 0;
+    PetscReal area = 0;
+
+    PetscCall(DMGetLabelName(dm_, l, &name));
+    const std::string own[] = {"celltype", "depth", "ghost", "marker", "Cell Sets", "Face Sets", "vtk"};
+    if (std::find(std::begin(own), std::end(own), name) != std::end(own)) continue;
+    PetscCall(DMGetLabel(dm_, name, &label));
+    PetscCall(DMLabelGetValueIS(label, values_is.out()));
+    PetscCall(ISGetLocalSize(values_is, &n_values));
+    PetscCall(ISGetIndices(values_is, &values));
+    if (n_values > 0) value = values[0];
+    PetscCall(ISRestoreIndices(values_is, &values));
+    if (value >= 0) {
+      ISHandle points_is;
+      const PetscInt *points;
+      PetscInt n_points;
+      PetscCall(DMLabelGetStratumIS(label, value, points_is.out()));
+      PetscCall(ISGetLocalSize(points_is, &n_points));
+      PetscCall(ISGetIndices(points_is, &points));
+      for (PetscInt i = 0; i < n_points; ++i) {
+        PetscInt support;
+        PetscReal a;
+        if (points[i] < face_begin || points[i] >= face_end) continue;
+        PetscCall(DMPlexGetSupportSize(dm_, points[i], &support));
+        PetscCall(DMPlexComputeCellGeometryFVM(dm_, points[i], &a, nullptr, nullptr));
+        ++faces;
+        if (support > 1) ++interior;
+        else area += a;
+      }
+      PetscCall(ISRestoreIndices(points_is, &points));
+    }
+    PetscInt found[2] = {faces, interior};
+    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, found, 2, MPIU_INT, MPI_SUM, comm));
+    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &value, 1, MPIU_INT, MPI_MAX, comm));
+    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &area, 1, MPIU_REAL, MPI_SUM, comm));
+    if (found[0] > 0 && found[1] == 0) surfaces_[name] = {label, value, area};
+  }
+  PulmoUserCheck(!surfaces_.empty(), comm,
+                 "the mesh %s names no surface; give its boundary physical names such as airway and pleura", file_.c_str());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+std::string Mesh::surface_names() const
+{
+  std::string names;
+  for (const auto &[name, surface] : surfaces_) names += (names.empty() ? "" : ", ") + name;
+  return names;
+}
+
+PetscErrorCode Mesh::require_surfaces(const std::vector<std::string> &names, const std::string &option) const
+{
+  PetscFunctionBeginUser;
+  for (const std::string &name : names)
+    PulmoUserCheck(surfaces_.count(name), PetscObjectComm((PetscObject)(DM)dm_),
+                   "the mesh %s has no surface '%s', which %s asks for; it has %s: name one of these", file_.c_str(),
+                   name.c_str(), option.c_str(), surface_names().c_str());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Mesh::node_coordinates(PetscInt point, PetscReal x[3]) const
+{
+  PetscInt vertex_begin, vertex_end;
+  PetscSection section;
+  Vec coordinates;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMPlexGetDepthStratum(dm_, 0, &vertex_begin, &vertex_end));
+  PetscCall(DMGetCoordinateSection(dm_, &section));
+  PetscCall(DMGetCoordinatesLocal(dm_, &coordinates));
+  const ReadArray values(coordinates);
+  const PetscInt *ends = &point;
+  PetscInt n = 1;
+  if (point < vertex_begin || point >= vertex_end) {
+    PetscCall(DMPlexGetCone(dm_, point, &ends));
+    PetscCall(DMPlexGetConeSize(dm_, point, &n));
+  }
+  for (int d = 0; d < 3; ++d) x[d] = 0;
+  for (PetscInt i = 0; i < n; ++i) {
+    PetscInt offset;
+    PetscCall(PetscSectionGetOffset(section, ends[i], &offset));
+    for (int d = 0; d < 3; ++d) x[d] += values[offset + d] / n;
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Mesh::rigid_pins(std::array<Pin, 3> &pins) const
+{
+  using Coordinates = std::array<PetscReal, 3>;
+  const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
+  PetscInt begin, end;
+  std::array<Coordinates, 3> chosen{};
+  const auto minus = [](const Coordinates &a, const Coordinates &b) {
+    return Coordinates{a[0] - b[0], a[1] - b[1], a[2] - b[2]};
+  };
+  const auto cross = [](const Coordinates &a, const Coordinates &b) {
+    return Coordinates{a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]};
+  };
+  const auto norm = [](const Coordinates &a) { return std::hypot(a[0], a[1], a[2]); };
+  const auto largest = [](const Coordinates &a) {
+    int d = 0;
+    for (int i = 1; i < 3; ++i)
+      if (std::abs(a[i]) > std::abs(a[d])) d = i;
+    return d;
+  };
+
+  PetscFunctionBeginUser;
+  PetscCall(DMPlexGetDepthStratum(dm_, 0, &begin, &end));
+  // A: the lowest vertex; B: the farthest from A; C: the farthest from the line AB. Every rank that shares a
+  // vertex has the same coordinates for it, so the choice by coordinates is the same on all.
+  for (int k = 0; k < 3; ++k) {
+    double best[4] = {-1e300, 0, 0, 0}, global[4];
+    for (PetscInt v = begin; v < end; ++v) {
+      Coordinates x;
+      PetscCall(node_coordinates(v, x.data()));
+      const PetscReal score = k == 0   ? -x[2]
+                              : k == 1 ? norm(minus(x, chosen[0]))
+                                       : norm(cross(minus(x, chosen[0]), minus(chosen[1], chosen[0])));
+      if (score > best[0]) {
+        best[0] = score;
+        for (int d = 0; d < 3; ++d) best[d + 1] = x[d];
+      }
+    }
+    struct {
+      double score;
+      int rank;
+    } mine, winner;
+    PetscMPIInt rank;
+    PetscCallMPI(MPI_Comm_rank(comm, &rank));
+    mine = {best[0], rank};
+    PetscCallMPI(MPI_Allreduce(&mine, &winner, 1, MPI_DOUBLE_INT, MPI_MAXLOC, comm));
+    for (int d = 0; d < 4; ++d) global[d] = best[d];
+    PetscCallMPI(MPI_Bcast(global, 4, MPI_DOUBLE, winner.rank, comm));
+    for (int d = 0; d < 3; ++d) chosen[k][d] = global[d + 1];
+  }
+  const Coordinates AB = minus(chosen[1], chosen[0]), normal = cross(AB, minus(chosen[2], chosen[0]));
+  for (int k = 0; k < 3; ++k) {
+    Pin &pin = pins[k];
+    pin = Pin();
+    for (int d = 0; d < 3; ++d) {
+      pin.x[d] = chosen[k][d];
+      pin.component[d] = k == 0 || (k == 1 && d != largest(AB)) || (k == 2 && d == largest(normal));
+    }
+    for (PetscInt v = begin; v < end; ++v) {
+      Coordinates x;
+      PetscCall(node_coordinates(v, x.data()));
+      if (x == chosen[k]) pin.vertex = v;
+    }
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace pulmo

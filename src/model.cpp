@@ -1,0 +1,385 @@
+#include "pulmo/model.hpp"
+
+#include "pulmo/mesh.hpp"
+
+#include <algorithm>
+#include <cstring>
+
+namespace pulmo {
+
+PetscErrorCode Model::declare(Options &options)
+{
+  PetscFunctionBeginUser;
+  options.group("quadrature", "integration (-petscfe_type pulmo|basic chooses the integrator)");
+  PetscCall(options.whole("degree", "-", Range::between(1, 8),
+                          "degree of the rule in the cells (3: 8 points, exact for det F; 4: 14 points, for checks)",
+                          quadrature_degree_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::build(Composition composition, PetscReal modulus)
+{
+  PetscFunctionBeginUser;
+  mesh_ = &composition.mesh();
+  composition_ = std::make_unique<Composition>(std::move(composition));
+  modulus_ = modulus;
+  PetscCall(DMClone(mesh_->dm(), dm_.out()));
+  PetscCall(create_fields());
+  PetscCall(create_weak_form());
+  PetscCall(create_section());
+  PetscCall(assembly_.setup(dm_));
+  row_scale_.assign(this->composition().fields().size(), 1);
+  PetscCall(set_step(1, 0));
+
+  if (!own_) {
+    // PETSc's own loops get the rates from an auxiliary field of the same discretisation, rows scaled afterwards
+    DM rate_dm;
+    PetscDS ds;
+    PetscSection section;
+    PetscCall(DMClone(dm_, &rate_dm));
+    *rate_dm_.out() = rate_dm;
+    PetscCall(DMCopyFields(dm_, rate_dm_));
+    PetscCall(DMCreateDS(rate_dm_));
+    PetscCall(DMGetDS(rate_dm_, &ds));
+    PetscCall(DMGetLocalSection(dm_, &section));
+    PetscCall(DMSetLocalSection(rate_dm_, section));
+    PetscCall(DMCreateLocalVector(rate_dm_, rate_.out()));
+    PetscCall(DMSetAuxiliaryVec(dm_, nullptr, 0, 0, rate_));
+    PetscCall(DMCreateGlobalVector(dm_, scale_.out()));
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::create_fields()
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
+  QuadratureHandle rule, face_rule;
+  PetscFE first = nullptr;
+  PetscBool own;
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscDTSimplexQuadrature(3, quadrature_degree_, PETSCDTSIMPLEXQUAD_MINSYM, rule.out()));
+  PetscCall(PetscDTSimplexQuadrature(2, std::max<PetscInt>(4, quadrature_degree_), PETSCDTSIMPLEXQUAD_MINSYM, face_rule.out()));
+  PetscInt index = 0;
+  for (const FieldSpec &field : composition().fields()) {
+    FEHandle fe;
+    PetscCall(PetscFECreateLagrange(comm, 3, field.components, PETSC_TRUE, field.degree, PETSC_DETERMINE, fe.out()));
+    PetscCall(PetscObjectSetName((PetscObject)(PetscFE)fe, field.name.c_str()));
+    if (!first) {
+      PetscCall(PetscFESetQuadrature(fe, rule));
+      PetscCall(PetscFESetFaceQuadrature(fe, face_rule));
+      first = fe;
+    } else {
+      PetscCall(PetscFECopyQuadrature(first, fe));
+    }
+    PetscCall(PetscFESetType(fe, "pulmo"));
+    PetscCall(PetscFESetFromOptions(fe));
+    PetscCall(PetscObjectTypeCompare((PetscObject)(PetscFE)fe, "pulmo", &own));
+    own_ = own;
+    PetscCall(DMSetField(dm_, index++, nullptr, (PetscObject)(PetscFE)fe));
+    if (index == 1) PetscCall(DMGetField(dm_, 0, nullptr, (PetscObject *)&first));
+  }
+  PetscCall(DMCreateDS(dm_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::create_weak_form()
+{
+  PetscDS ds;
+  PetscWeakForm volume;
+  std::map<std::pair<std::string, PetscInt>, PetscWeakForm> boundary; // of each surface and test field
+
+  PetscFunctionBeginUser;
+  PetscCall(DMGetDS(dm_, &ds));
+  PetscCall(PetscDSGetWeakForm(ds, &volume));
+  for (const Term &term : composition().terms()) {
+    if (term.surface.empty()) {
+      if (term.trial < 0) PetscCall(PetscWeakFormAddResidual(volume, nullptr, 0, term.test, 0, term.f0, term.f1));
+      else
+        PetscCall(PetscWeakFormAddJacobian(volume, nullptr, 0, term.test, term.trial, 0, term.g0, term.g1, term.g2, term.g3));
+      continue;
+    }
+    DMLabel label;
+    const PetscInt value = mesh_->surface(term.surface).value;
+    PetscCall(DMGetLabel(dm_, term.surface.c_str(), &label));
+    PetscWeakForm &wf = boundary[{term.surface, term.test}];
+    if (!wf) {
+      PetscInt bd;
+      PetscCall(DMAddBoundary(dm_, DM_BC_NATURAL, term.surface.c_str(), label, 1, &value, term.test, 0, nullptr, nullptr,
+                              nullptr, nullptr, &bd));
+      PetscCall(PetscDSGetBoundary(ds, bd, &wf, nullptr, nullptr, nullptr, nullptr, nullptr, nullptr, nullptr, nullptr,
+                                   nullptr, nullptr, nullptr));
+    }
+    if (term.trial < 0) PetscCall(PetscWeakFormAddBdResidual(wf, label, value, term.test, 0, term.bd_f0, term.bd_f1));
+    else
+      PetscCall(PetscWeakFormAddBdJacobian(wf, label, value, term.test, term.trial, 0, term.bd_g0, term.bd_g1, term.bd_g2,
+                                           term.bd_g3));
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// constraint_of[4 * point + component]: which constraint holds that component there, or -1; pressure is component 3.
+PetscErrorCode Model::find_constraints(std::vector<PetscInt> &constraint_of)
+{
+  PetscInt begin, end;
+  PetscSF sf;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMPlexGetChart(dm_, &begin, &end));
+  constraint_of.assign(static_cast<std::size_t>(4 * end), -1);
+  const auto &constraints = composition().constraints();
+  for (std::size_t k = 0; k < constraints.size(); ++k) {
+    const Constraint &constraint = constraints[k];
+    const auto hold = [&](PetscInt point) {
+      for (PetscInt c = 0; c < 3; ++c)
+        if (constraint.component[c])
+          constraint_of[4 * point + (constraint.field == displacement ? c : 3)] = static_cast<PetscInt>(k);
+    };
+    for (PetscInt vertex : constraint.vertices) hold(vertex);
+    if (constraint.surface.empty()) continue;
+    DMLabel label;
+    ISHandle stratum;
+    PetscCall(DMGetLabel(dm_, constraint.surface.c_str(), &label));
+    PetscCall(DMLabelGetStratumIS(label, mesh_->surface(constraint.surface).value, stratum.out()));
+    if (!stratum) continue;
+    PetscInt n;
+    const PetscInt *points;
+    PetscCall(ISGetLocalSize(stratum, &n));
+    PetscCall(ISGetIndices(stratum, &points));
+    for (PetscInt i = 0; i < n; ++i) {
+      PetscInt *closure = nullptr, n_closure;
+      PetscCall(DMPlexGetTransitiveClosure(dm_, points[i], PETSC_TRUE, &n_closure, &closure));
+      for (PetscInt j = 0; j < n_closure; ++j) hold(closure[2 * j]);
+      PetscCall(DMPlexRestoreTransitiveClosure(dm_, points[i], PETSC_TRUE, &n_closure, &closure));
+    }
+    PetscCall(ISRestoreIndices(stratum, &points));
+  }
+  // an edge or vertex of a surface may be on a rank that has none of the surface's facets
+  PetscCall(DMGetPointSF(dm_, &sf));
+  PetscInt roots;
+  PetscCall(PetscSFGetGraph(sf, &roots, nullptr, nullptr, nullptr));
+  if (roots >= 0) {
+    std::vector<PetscInt> one(static_cast<std::size_t>(end));
+    for (PetscInt c = 0; c < 4; ++c) {
+      for (PetscInt p = begin; p < end; ++p) one[p] = constraint_of[4 * p + c];
+      std::vector<PetscInt> all = one;
+      PetscCall(PetscSFReduceBegin(sf, MPIU_INT, one.data(), all.data(), MPI_MAX));
+      PetscCall(PetscSFReduceEnd(sf, MPIU_INT, one.data(), all.data(), MPI_MAX));
+      one = all;
+      PetscCall(PetscSFBcastBegin(sf, MPIU_INT, all.data(), one.data(), MPI_REPLACE));
+      PetscCall(PetscSFBcastEnd(sf, MPIU_INT, all.data(), one.data(), MPI_REPLACE));
+      for (PetscInt p = begin; p < end; ++p) constraint_of[4 * p + c] = one[p];
+    }
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::create_section()
+{
+  const auto &fields = composition().fields();
+  const auto n_fields = static_cast<PetscInt>(fields.size());
+  std::vector<PetscInt> constraint_of, components, dofs, bc_field;
+  std::vector<DMLabel> labels(fields.size(), nullptr);
+  std::vector<ISHandle> owned;
+  std::vector<IS> bc_components, bc_points;
+  PetscInt begin, end;
+  SectionHandle section;
+
+  PetscFunctionBeginUser;
+  PetscCall(find_constraints(constraint_of));
+  PetscCall(DMPlexGetChart(dm_, &begin, &end));
+  for (PetscInt f = 0; f < n_fields; ++f) {
+    PetscFE fe;
+    const PetscInt *per_depth;
+    PetscCall(DMGetField(dm_, f, nullptr, (PetscObject *)&fe));
+    PetscCall(PetscFEGetNumDof(fe, &per_depth));
+    components.push_back(fields[f].components);
+    dofs.insert(dofs.end(), per_depth, per_depth + 4);
+  }
+  // group the constrained points by field and set of components: no point is in two groups of a field
+  std::map<std::pair<PetscInt, int>, std::vector<PetscInt>> groups;
+  for (PetscInt p = begin; p < end; ++p) {
+    int set = 0;
+    for (int c = 0; c < 3; ++c)
+      if (constraint_of[4 * p + c] >= 0) set |= 1 << c;
+    if (set) groups[{displacement, set}].push_back(p);
+    if (constraint_of[4 * p + 3] >= 0 && n_fields > pressure) groups[{pressure, 1}].push_back(p);
+  }
+  // every rank passes the same groups in the same order
+  for (PetscInt f = 0; f < std::min<PetscInt>(n_fields, 2); ++f)
+    for (int set = 1; set < (f == displacement ? 8 : 2); ++set) {
+      const auto &points = groups[{f, set}];
+      std::vector<PetscInt> which;
+      for (int c = 0; c < 3; ++c)
+        if (set & (1 << c)) which.push_back(c);
+      owned.emplace_back();
+      PetscCall(ISCreateGeneral(PETSC_COMM_SELF, (PetscInt)which.size(), which.data(), PETSC_COPY_VALUES, owned.back().out()));
+      bc_components.push_back(owned.back());
+      owned.emplace_back();
+      PetscCall(ISCreateGeneral(PETSC_COMM_SELF, (PetscInt)points.size(), points.data(), PETSC_COPY_VALUES, owned.back().out()));
+      bc_points.push_back(owned.back());
+      bc_field.push_back(f);
+    }
+  PetscCall(DMPlexCreateSection(dm_, labels.data(), components.data(), dofs.data(), (PetscInt)bc_field.size(), bc_field.data(),
+                                bc_components.data(), bc_points.data(), nullptr, section.out()));
+  for (PetscInt f = 0; f < n_fields; ++f) PetscCall(PetscSectionSetFieldName(section, f, fields[f].name.c_str()));
+  PetscCall(DMSetLocalSection(dm_, section));
+
+  prescribed_.clear();
+  for (PetscInt p = begin; p < end; ++p) {
+    for (PetscInt c = 0; c < 4; ++c) {
+      const PetscInt k = constraint_of[4 * p + c], f = c < 3 ? displacement : pressure;
+      PetscInt dof, offset;
+      if (k < 0 || f >= n_fields) continue;
+      PetscCall(PetscSectionGetFieldDof(section, p, f, &dof));
+      if (dof == 0) continue;
+      PetscCall(PetscSectionGetFieldOffset(section, p, f, &offset));
+      Prescribed value{};
+      value.component = static_cast<std::int16_t>(c < 3 ? c : 0);
+      value.dof = offset + value.component;
+      value.constraint = static_cast<std::int16_t>(k);
+      PetscCall(mesh_->node_coordinates(p, value.x));
+      prescribed_.push_back(value);
+    }
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::set_step(PetscReal dt, PetscReal airway_pressure)
+{
+  const PetscReal L = mesh_->length();
+
+  PetscFunctionBeginUser;
+  step_ = {dt, airway_pressure};
+  row_scale_[displacement] = 1 / (modulus_ * L * L);
+  if (row_scale_.size() > pressure) row_scale_[pressure] = dt / (L * L * L);
+  PetscCall(pack_constants());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::pack_constants()
+{
+  PetscDS ds;
+  std::vector<ParameterBlock> blocks = composition().parameter_blocks();
+
+  PetscFunctionBeginUser;
+  blocks.push_back({Step::owner, reinterpret_cast<const PetscScalar *>(&step_), sizeof(Step) / sizeof(PetscScalar)});
+  // the step is asked for by every kernel: first in the directory
+  std::rotate(blocks.begin(), blocks.end() - 1, blocks.end());
+  const auto n = static_cast<PetscInt>(blocks.size());
+  constants_.assign(1, static_cast<PetscScalar>(n));
+  PetscInt offset = 1 + 2 * n;
+  for (const ParameterBlock &block : blocks) {
+    constants_.push_back(constants::tag(block.owner));
+    constants_.push_back(static_cast<PetscScalar>(offset));
+    offset += block.count;
+  }
+  for (const ParameterBlock &block : blocks) constants_.insert(constants_.end(), block.data, block.data + block.count);
+  PetscCall(DMGetDS(dm_, &ds));
+  PetscCall(PetscDSSetConstants(ds, offset, constants_.data()));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::constrain(PetscReal t, Vec local) const
+{
+  PetscFunctionBeginUser;
+  WriteArray x(local);
+  for (const Prescribed &p : prescribed_) {
+    PetscScalar value[3] = {0, 0, 0};
+    composition().constraints()[p.constraint].value(t, p.x, value);
+    x[p.dof] = value[p.component];
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::constrain_rate(Vec local, Vec before, PetscReal dt, Vec rate) const
+{
+  PetscFunctionBeginUser;
+  const ReadArray now(local), then(before);
+  WriteArray r(rate);
+  for (const Prescribed &p : prescribed_) r[p.dof] = (now[p.dof] - then[p.dof]) / dt;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::residual(PetscReal t, Vec x, Vec x_t, Vec F)
+{
+  PetscFunctionBeginUser;
+  PetscCall(VecZeroEntries(F));
+  if (own_) PetscCall(assembly_.residual(t, x, x_t, row_scale_.data(), F));
+  else PetscCall(stock_residual(t, x, x_t, F));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// PETSc's own loop over cells, then the scaling of the rows.
+PetscErrorCode Model::stock_residual(PetscReal t, Vec x, Vec x_t, Vec F)
+{
+  PetscFunctionBeginUser;
+  PetscCall(VecCopy(x_t, rate_));
+  PetscCall(DMPlexTSComputeIFunctionFEM(dm_, t, x, x_t, F, nullptr));
+  WriteArray f(F);
+  PetscSection section;
+  PetscInt begin, end;
+  PetscCall(DMGetLocalSection(dm_, &section));
+  PetscCall(PetscSectionGetChart(section, &begin, &end));
+  for (PetscInt p = begin; p < end; ++p)
+    for (std::size_t field = 0; field < row_scale_.size(); ++field) {
+      PetscInt dof, offset;
+      PetscCall(PetscSectionGetFieldDof(section, p, (PetscInt)field, &dof));
+      PetscCall(PetscSectionGetFieldOffset(section, p, (PetscInt)field, &offset));
+      for (PetscInt d = 0; d < dof; ++d) f[offset + d] *= row_scale_[field];
+    }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, Mat A)
+{
+  PetscFunctionBeginUser;
+  if (own_) {
+    PetscCall(assembly_.jacobian(t, x, x_t, shift, row_scale_.data(), A));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+  PetscCall(VecCopy(x_t, rate_));
+  PetscCall(DMPlexTSComputeIJacobianFEM(dm_, t, x, x_t, shift, A, A, nullptr));
+  for (std::size_t field = 0; field < row_scale_.size(); ++field) {
+    ISHandle rows;
+    DM unused = nullptr;
+    const auto f = static_cast<PetscInt>(field);
+    PetscCall(DMCreateSubDM(dm_, 1, &f, rows.out(), &unused));
+    PetscCall(DMDestroy(&unused));
+    PetscCall(VecISSet(scale_, rows, row_scale_[field]));
+  }
+  PetscCall(MatDiagonalScale(A, scale_, nullptr));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::airway_flow(Vec F, PetscReal &flow) const
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
+  double sum = 0;
+
+  PetscFunctionBeginUser;
+  if (row_scale_.size() > pressure) {
+    const ReadArray f(F);
+    for (const Prescribed &p : prescribed_)
+      if (composition().constraints()[p.constraint].at_airway) sum += f[p.dof] / row_scale_[pressure];
+  }
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &sum, 1, MPI_DOUBLE, MPI_SUM, comm));
+  flow = sum;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::reaction(Vec F, PetscReal force[3]) const
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
+
+  PetscFunctionBeginUser;
+  force[0] = force[1] = force[2] = 0;
+  const ReadArray f(F);
+  for (const Prescribed &p : prescribed_)
+    if (composition().constraints()[p.constraint].field == displacement)
+      force[p.component] += f[p.dof] / row_scale_[displacement];
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, force, 3, MPIU_REAL, MPI_SUM, comm));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace pulmo

@@ -1,0 +1,335 @@
+#include "pulmo/options.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <cstdlib>
+#include <sstream>
+
+namespace pulmo {
+
+namespace {
+
+std::string number_text(double v)
+{
+  std::ostringstream s;
+  s << v;
+  return s.str();
+}
+
+std::vector<std::string> split(const std::string &text, char separator)
+{
+  std::vector<std::string> parts;
+  std::stringstream stream(text);
+  for (std::string part; std::getline(stream, part, separator);) {
+    const auto first = part.find_first_not_of(" \t"), last = part.find_last_not_of(" \t");
+    if (first != std::string::npos) parts.push_back(part.substr(first, last - first + 1));
+  }
+  return parts;
+}
+
+std::string join(const std::vector<std::string> &parts, const char *separator)
+{
+  std::string s;
+  for (const auto &part : parts) s += (s.empty() ? "" : separator) + part;
+  return s;
+}
+
+/// Levenshtein distance.
+std::size_t distance(const std::string &a, const std::string &b)
+{
+  std::vector<std::size_t> row(b.size() + 1);
+  for (std::size_t j = 0; j <= b.size(); ++j) row[j] = j;
+  for (std::size_t i = 1; i <= a.size(); ++i) {
+    std::size_t diagonal = row[0];
+    row[0] = i;
+    for (std::size_t j = 1; j <= b.size(); ++j) {
+      const std::size_t change = diagonal + (a[i - 1] != b[j - 1]);
+      diagonal = row[j];
+      row[j] = std::min({row[j] + 1, row[j - 1] + 1, change});
+    }
+  }
+  return row[b.size()];
+}
+
+} // namespace
+
+std::string Range::text() const
+{
+  const bool below = std::isfinite(low), above = std::isfinite(high);
+  const std::string lt = open ? " < " : " <= ", gt = open ? "> " : ">= ";
+  if (below && above) return number_text(low) + lt + "value" + lt + number_text(high);
+  if (below) return gt + number_text(low);
+  if (above) return (open ? "< " : "<= ") + number_text(high);
+  return "any";
+}
+
+void Options::group(const std::string &name, const std::string &about, bool in_use, const std::string &enabled_by)
+{
+  groups_.push_back({name, about, enabled_by, in_use});
+}
+
+std::string Options::full(const std::string &name) const
+{
+  const std::string &group = groups_.back().name;
+  return "-" + group + (group.empty() || name.empty() ? "" : "_") + name;
+}
+
+PetscErrorCode Options::given(const std::string &name, bool &is_given) const
+{
+  PetscBool has;
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscOptionsHasName(nullptr, nullptr, full(name).c_str(), &has));
+  is_given = has;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Options::find(const std::string &name, const std::string &default_value, const std::string &unit,
+                             const std::string &range, const std::string &help, std::string &raw, bool &is_given)
+{
+  const std::string option = full(name);
+  const Group &group = groups_.back();
+  char buffer[4096] = "";
+  PetscBool set, has;
+
+  PetscFunctionBeginUser;
+  declared_.push_back({option, default_value, unit, range, help, groups_.size() - 1});
+  PetscCall(PetscOptionsGetString(nullptr, nullptr, option.c_str(), buffer, sizeof(buffer), &set));
+  PetscCall(PetscOptionsHasName(nullptr, nullptr, option.c_str(), &has));
+  is_given = has && group.in_use; // check_unknown() reports an option of an effect or law that is not in use
+  if (is_given) raw = buffer;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Options::parse_number(const std::string &option, const std::string &raw, const std::string &unit,
+                                     const Range &range, double &value) const
+{
+  char *end = nullptr;
+
+  PetscFunctionBeginUser;
+  value = std::strtod(raw.c_str(), &end);
+  PulmoUserCheck(!raw.empty() && *end == '\0' && std::isfinite(value), comm_,
+                 "option %s takes a number (%s), not '%s'", option.c_str(), unit.c_str(), raw.c_str());
+  PulmoUserCheck(range.holds(value), comm_, "option %s %s (%s) is out of range; it must be %s", option.c_str(),
+                 raw.c_str(), unit.c_str(), range.text().c_str());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Options::real(const std::string &name, const std::string &unit, Range range, const std::string &help,
+                             PetscReal &value)
+{
+  std::string raw;
+  bool is_given;
+
+  PetscFunctionBeginUser;
+  PetscCall(find(name, number_text(value), unit, range.text(), help, raw, is_given));
+  if (is_given) {
+    double number;
+    PetscCall(parse_number(full(name), raw, unit, range, number));
+    value = number;
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Options::whole(const std::string &name, const std::string &unit, Range range, const std::string &help,
+                              PetscInt &value)
+{
+  std::string raw;
+  bool is_given;
+
+  PetscFunctionBeginUser;
+  PetscCall(find(name, std::to_string(value), unit, range.text(), help, raw, is_given));
+  if (is_given) {
+    double number;
+    PetscCall(parse_number(full(name), raw, unit, range, number));
+    PulmoUserCheck(number == std::floor(number), comm_, "option %s takes a whole number, not '%s'", full(name).c_str(),
+                   raw.c_str());
+    value = static_cast<PetscInt>(number);
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Options::flag(const std::string &name, const std::string &help, bool &value)
+{
+  std::string raw;
+  bool is_given;
+
+  PetscFunctionBeginUser;
+  PetscCall(find(name, value ? "on" : "off", "on/off", "", help, raw, is_given));
+  if (is_given) {
+    static const std::vector<std::string> yes{"", "on", "true", "yes", "1"}, no{"off", "false", "no", "0"};
+    std::transform(raw.begin(), raw.end(), raw.begin(), [](unsigned char c) { return std::tolower(c); });
+    const bool on = std::find(yes.begin(), yes.end(), raw) != yes.end();
+    PulmoUserCheck(on || std::find(no.begin(), no.end(), raw) != no.end(), comm_, "option %s is on or off, not '%s'",
+                   full(name).c_str(), raw.c_str());
+    value = on;
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Options::text(const std::string &name, const std::string &help, std::string &value)
+{
+  std::string raw;
+  bool is_given;
+
+  PetscFunctionBeginUser;
+  PetscCall(find(name, value, "text", "", help, raw, is_given));
+  if (is_given) {
+    PulmoUserCheck(!raw.empty(), comm_, "option %s needs a value", full(name).c_str());
+    value = raw;
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Options::choice(const std::string &name, const std::vector<std::string> &choices,
+                               const std::string &help, std::string &value)
+{
+  std::string raw;
+  bool is_given;
+
+  PetscFunctionBeginUser;
+  PetscCall(find(name, value, "one of " + join(choices, "|"), "", help, raw, is_given));
+  if (is_given) {
+    PulmoUserCheck(std::find(choices.begin(), choices.end(), raw) != choices.end(), comm_,
+                   "option %s knows no '%s'; it takes one of %s", full(name).c_str(), raw.c_str(),
+                   join(choices, ", ").c_str());
+    value = raw;
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Options::names(const std::string &name, const std::string &help, std::vector<std::string> &value)
+{
+  std::string raw;
+  bool is_given;
+
+  PetscFunctionBeginUser;
+  PetscCall(find(name, join(value, ","), "names, separated by commas", "", help, raw, is_given));
+  if (is_given) {
+    value = split(raw, ',');
+    PulmoUserCheck(!value.empty(), comm_, "option %s names nothing", full(name).c_str());
+    auto sorted = value;
+    std::sort(sorted.begin(), sorted.end());
+    const auto twice = std::adjacent_find(sorted.begin(), sorted.end());
+    PulmoUserCheck(twice == sorted.end(), comm_, "option %s names '%s' twice", full(name).c_str(), twice->c_str());
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Options::vector(const std::string &name, const std::string &unit, const std::string &help,
+                               PetscReal value[3])
+{
+  std::string raw;
+  bool is_given;
+
+  PetscFunctionBeginUser;
+  PetscCall(find(name, number_text(value[0]) + "," + number_text(value[1]) + "," + number_text(value[2]), unit, "", help,
+                 raw, is_given));
+  if (is_given) {
+    const auto parts = split(raw, ',');
+    PulmoUserCheck(parts.size() == 3, comm_, "option %s takes three numbers (%s) separated by commas, not '%s'",
+                   full(name).c_str(), unit.c_str(), raw.c_str());
+    for (int d = 0; d < 3; ++d) {
+      double number;
+      PetscCall(parse_number(full(name), parts[d], unit, Range::any(), number));
+      value[d] = number;
+    }
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+std::string Options::nearest(const std::string &name) const
+{
+  std::string best;
+  std::size_t least = name.size() / 3 + 2;
+  for (const Declared &d : declared_) {
+    const std::size_t away = distance(d.name, name);
+    if (away < least) {
+      least = away;
+      best = d.name;
+    }
+  }
+  return best;
+}
+
+PetscErrorCode Options::all_given(std::vector<std::pair<std::string, std::string>> &list) const
+{
+  char *all = nullptr;
+
+  PetscFunctionBeginUser;
+  list.clear();
+  PetscCall(PetscOptionsGetAll(nullptr, &all));
+  std::istringstream stream(all);
+  PetscCall(PetscFree(all));
+  // the database prints "-name value -name value ..."; a value never begins with '-' and a letter
+  for (std::string word; stream >> word;) {
+    const bool is_name = word.size() > 1 && word[0] == '-' && std::isalpha(static_cast<unsigned char>(word[1]));
+    if (is_name) list.emplace_back(word, "");
+    else if (!list.empty()) list.back().second += (list.back().second.empty() ? "" : " ") + word;
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Options::check_unknown() const
+{
+  std::vector<std::pair<std::string, std::string>> list;
+
+  PetscFunctionBeginUser;
+  PetscCall(all_given(list));
+  for (const auto &[name, value] : list) {
+    const Declared *idle = nullptr;
+    bool in_use = false;
+    for (const Declared &d : declared_) {
+      if (d.name != name) continue;
+      if (groups_[d.group].in_use) in_use = true;
+      else idle = &d;
+    }
+    if (in_use) continue;
+    PulmoUserCheck(!idle, comm_, "option %s has no effect in this scene: it needs %s", name.c_str(),
+                   groups_[idle->group].enabled_by.c_str());
+    for (const Group &group : groups_) {
+      const std::string prefix = "-" + group.name;
+      const bool ours = !group.name.empty() && name.compare(0, prefix.size(), prefix) == 0 &&
+                        (name.size() == prefix.size() || name[prefix.size()] == '_');
+      if (!ours) continue;
+      const std::string guess = nearest(name);
+      PulmoUserError(comm_, "unknown option %s%s; pulmo -help lists all", name.c_str(),
+                     guess.empty() ? "" : (": did you mean " + guess + "?").c_str());
+    }
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Options::warn_unused() const
+{
+  PetscInt n;
+  char **names, **values;
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscOptionsLeftGet(nullptr, &n, &names, &values));
+  for (PetscInt i = 0; i < n; ++i) {
+    const std::string name = std::string("-") + names[i], guess = nearest(name);
+    PetscCall(PetscPrintf(comm_, "pulmo: warning: option %s was not used%s\n", name.c_str(),
+                          guess.empty() ? "" : ("; did you mean " + guess + "?").c_str()));
+  }
+  PetscCall(PetscOptionsLeftRestore(nullptr, &n, &names, &values));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Options::print_help() const
+{
+  std::size_t last = groups_.size();
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscPrintf(comm_, "pulmo's own options (beside PETSc's: -dm_plex_filename, -ts_*, -snes_*, -ksp_*, -pc_*):\n"));
+  for (const Declared &d : declared_) {
+    if (d.group != last) PetscCall(PetscPrintf(comm_, "\n%s\n", groups_[d.group].about.c_str()));
+    last = d.group;
+    PetscCall(PetscPrintf(comm_, "  %-34s %s [%s]%s (default %s)\n", d.name.c_str(), d.help.c_str(), d.unit.c_str(),
+                          d.range.empty() || d.range == "any" ? "" : (" " + d.range).c_str(),
+                          d.value.empty() ? "none" : d.value.c_str()));
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace pulmo

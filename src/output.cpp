@@ -1,0 +1,156 @@
+#include "pulmo/output.hpp"
+
+#include "pulmo/units.hpp"
+
+#include <filesystem>
+#include <system_error>
+
+namespace pulmo {
+
+namespace {
+
+namespace fs = std::filesystem;
+
+/// A rank-0 condition known on all ranks.
+PetscErrorCode on_all_ranks(MPI_Comm comm, bool &value)
+{
+  int v = value;
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Bcast(&v, 1, MPI_INT, 0, comm));
+  value = v != 0;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace
+
+PetscErrorCode Output::declare(Options &options)
+{
+  PetscFunctionBeginUser;
+  options.group("output", "output");
+  PetscCall(options.text("dir", "directory of the results (made if absent)", directory_));
+  PetscCall(options.flag("overwrite", "replace a finished run in that directory", overwrite_));
+  PetscCall(options.real("fields_every", "s", Range::not_negative(),
+                         "interval of field snapshots, at the first step at or after (0: at the end of each phase)",
+                         fields_every_));
+  options.group("progress", "progress");
+  PetscCall(options.flag("", "one line a step", progress_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Output::prepare(const Options &options)
+{
+  const MPI_Comm comm = options.comm();
+  PetscMPIInt rank;
+  bool free = true, writable = true;
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  if (rank == 0) {
+    std::error_code error;
+    free = overwrite_ || !fs::exists(path("summary.json"), error);
+    if (free) {
+      fs::create_directories(directory_, error);
+      const std::string probe = path(".pulmo_probe");
+      std::FILE *f = std::fopen(probe.c_str(), "w");
+      writable = f && std::fputs("pulmo\n", f) >= 0;
+      if (f) writable = std::fclose(f) == 0 && writable;
+      fs::remove(probe, error);
+    }
+  }
+  PetscCall(on_all_ranks(comm, free));
+  PetscCall(on_all_ranks(comm, writable));
+  PulmoUserCheck(free, comm, "-output_dir %s holds a finished run; give another directory or -output_overwrite",
+                 directory_.c_str());
+  PulmoUserCheck(writable, comm, "-output_dir %s cannot be written; choose another directory or free the disk",
+                 directory_.c_str());
+  if (rank == 0) { // what an earlier run left must not pass for this one's
+    std::error_code error;
+    for (const char *old : {"summary.json", "failure.json", "signals.csv", "signals.csv.part", "fields.xdmf", "fields.h5"})
+      fs::remove(path(old), error);
+    for (const auto &entry : fs::directory_iterator(directory_, error)) {
+      const std::string name = entry.path().filename().string();
+      if (name.rfind("fields_", 0) == 0 && entry.path().extension() == ".h5") fs::remove(entry.path(), error);
+    }
+  }
+  PetscCallMPI(MPI_Barrier(comm));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+SignalWriter::~SignalWriter()
+{
+  if (file_) std::fclose(file_);
+}
+
+PetscErrorCode SignalWriter::observe(const StepReport &step)
+{
+  PetscMPIInt rank;
+  bool written = true;
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Comm_rank(comm_, &rank));
+  if (rank == 0) {
+    const bool ventilator = facts_.ventilator != nullptr, flow = ventilator || facts_.airflow;
+    if (!file_) {
+      file_ = std::fopen(output_.path("signals.csv.part").c_str(), "w");
+      if (file_)
+        std::fprintf(file_, "time_s,%s%svolume_ml,%sdt_s,newton_iterations,krylov_iterations,min_J,max_J\n",
+                     ventilator ? "airway_pressure_cmH2O," : "", flow ? "flow_ml_per_s," : "", ventilator ? "phase," : "");
+    }
+    if (file_) {
+      const SignalRow &r = step.row;
+      std::fprintf(file_, "%.15g,", r.time);
+      if (ventilator) std::fprintf(file_, "%.15g,", r.pressure);
+      if (flow) std::fprintf(file_, "%.15g,", r.flow);
+      std::fprintf(file_, "%.15g,", r.volume);
+      if (ventilator) std::fprintf(file_, "%s,", r.phase.c_str());
+      std::fprintf(file_, "%.15g,%ld,%ld,%.15g,%.15g\n", r.dt, r.newton, r.krylov, r.min_J, r.max_J);
+    }
+    written = file_ && std::fflush(file_) == 0 && !std::ferror(file_);
+  }
+  PetscCall(on_all_ranks(comm_, written));
+  PulmoUserCheck(written, comm_, "cannot write %s; free the disk or choose another -output_dir",
+                 output_.path("signals.csv.part").c_str());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode SignalWriter::finish()
+{
+  PetscMPIInt rank;
+  bool written = true;
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Comm_rank(comm_, &rank));
+  if (rank == 0 && file_) {
+    std::error_code error;
+    written = std::fclose(file_) == 0;
+    file_ = nullptr;
+    fs::rename(output_.path("signals.csv.part"), output_.path("signals.csv"), error);
+    written = written && !error;
+  }
+  PetscCall(on_all_ranks(comm_, written));
+  PulmoUserCheck(written, comm_, "cannot write %s; free the disk or choose another -output_dir",
+                 output_.path("signals.csv").c_str());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode ProgressPrinter::observe(const StepReport &step)
+{
+  const SignalRow &r = step.row;
+  PetscLogDouble now;
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscTime(&now));
+  if (r.dt == 0) {
+    start_ = now;
+    PetscCall(PetscPrintf(comm_, "%9s %10s %6s %6s %10s %10s %8s %8s  %s\n", "time s", "dt s", "Newton", "Krylov",
+                          "P cmH2O", "V ml", "min J", "ETA s", facts_.ventilator ? "phase" : ""));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+  const double left = r.time > 0 ? (now - start_) * (step.end - r.time) / r.time : 0;
+  PetscCall(PetscPrintf(comm_, "%9.4f %10.3g %6ld %6ld %10.3f %10.3f %8.4f %8.0f  %s\n", r.time, r.dt, r.newton, r.krylov,
+                        r.pressure, r.volume, r.min_J, left, facts_.ventilator ? r.phase.c_str() : ""));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace pulmo

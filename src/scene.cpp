@@ -1,0 +1,60 @@
+#include "pulmo/scene.hpp"
+
+namespace pulmo {
+
+Scene::Scene(const Registry &registry)
+{
+  auto tissue = std::make_unique<Tissue>(registry.make_tissue_laws());
+  auto airflow = std::make_unique<Airflow>(registry.make_permeability_laws());
+  auto ventilator = std::make_unique<Ventilator>();
+  tissue_ = tissue.get();
+  airflow_ = airflow.get();
+  ventilator_ = ventilator.get();
+  effects_.push_back(std::move(tissue));
+  effects_.push_back(std::move(airflow));
+  effects_.push_back(std::move(ventilator));
+  for (auto &effect : registry.make_effects()) effects_.push_back(std::move(effect));
+}
+
+PetscErrorCode Scene::declare(Options &options)
+{
+  PetscFunctionBeginUser;
+  PetscCall(mesh_.declare(options));
+  for (const auto &effect : effects_) PetscCall(effect->declare(options));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Scene::prepare(const Options &options)
+{
+  PetscFunctionBeginUser;
+  for (const auto &effect : effects_)
+    if (effect->active()) PetscCall(effect->announce(facts_));
+  PetscCall(mesh_.read(options, facts_.ventilator != nullptr));
+  for (const auto &effect : effects_)
+    if (effect->active()) PetscCall(effect->check(options, mesh_, facts_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Scene::compose(Composition &composition) const
+{
+  PetscFunctionBeginUser;
+  for (const Effect *effect : active()) {
+    composition.speaker(effect->name());
+    effect->fields(composition);
+  }
+  for (const Effect *effect : active()) {
+    composition.speaker(effect->name());
+    PetscCall(effect->terms(composition, facts_));
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+std::vector<const Effect *> Scene::active() const
+{
+  std::vector<const Effect *> list;
+  for (const auto &effect : effects_)
+    if (effect->active()) list.push_back(effect.get());
+  return list;
+}
+
+} // namespace pulmo

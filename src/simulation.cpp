@@ -1,0 +1,419 @@
+#include "pulmo/simulation.hpp"
+
+#include "pulmo/units.hpp"
+
+#include <petsc/private/tsimpl.h>
+#include <algorithm>
+#include <cmath>
+#include <sstream>
+
+namespace pulmo {
+
+namespace {
+
+/// Two times closer than this share of the step are the same.
+constexpr PetscReal same_time = 1e-9;
+
+class Stopwatch {
+public:
+  explicit Stopwatch(double &seconds) : seconds_(seconds) { (void)PetscTime(&start_); }
+  ~Stopwatch()
+  {
+    PetscLogDouble end;
+    (void)PetscTime(&end);
+    seconds_ += end - start_;
+  }
+  Stopwatch(const Stopwatch &) = delete;
+  Stopwatch &operator=(const Stopwatch &) = delete;
+
+private:
+  double &seconds_;
+  PetscLogDouble start_ = 0;
+};
+
+PetscErrorCode ifunction(TS, PetscReal t, Vec X, Vec Xdot, Vec F, void *simulation)
+{
+  return static_cast<Simulation *>(simulation)->residual(t, X, Xdot, F);
+}
+
+PetscErrorCode ijacobian(TS, PetscReal t, Vec X, Vec Xdot, PetscReal shift, Mat A, Mat, void *simulation)
+{
+  return static_cast<Simulation *>(simulation)->jacobian(t, X, Xdot, shift, A);
+}
+
+PetscErrorCode simulation_of(TS ts, Simulation **simulation)
+{
+  PetscFunctionBeginUser;
+  PetscCall(TSGetApplicationContext(ts, simulation));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode post_stage(TS ts, PetscReal, PetscInt, Vec *)
+{
+  Simulation *simulation;
+
+  PetscFunctionBeginUser;
+  PetscCall(simulation_of(ts, &simulation));
+  PetscCall(simulation->after_stage());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode post_step(TS ts)
+{
+  Simulation *simulation;
+
+  PetscFunctionBeginUser;
+  PetscCall(simulation_of(ts, &simulation));
+  PetscCall(simulation->after_step());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode check_stage(TSAdapt, TS ts, PetscReal, Vec X, PetscBool *accept)
+{
+  Simulation *simulation;
+
+  PetscFunctionBeginUser;
+  PetscCall(simulation_of(ts, &simulation));
+  PetscCall(simulation->accept_stage(X, accept));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode choose_step(TSAdapt adapt, TS ts, PetscReal h, PetscInt *next_scheme, PetscReal *next_h, PetscBool *accept,
+                           PetscReal *wlte, PetscReal *wltea, PetscReal *wlter)
+{
+  Simulation *simulation;
+
+  PetscFunctionBeginUser;
+  PetscCall(simulation_of(ts, &simulation));
+  *next_scheme = 0;
+  *accept = PETSC_TRUE;
+  *next_h = simulation->next_step(ts->ptime + h, h, adapt->clip[1]);
+  *wlte = *wltea = *wlter = -1; // no error is estimated
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode create_step_control(TSAdapt adapt)
+{
+  PetscFunctionBeginUser;
+  adapt->ops->choose = choose_step;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace
+
+PetscErrorCode register_step_control()
+{
+  PetscFunctionBeginUser;
+  PetscCall(TSAdaptRegister("pulmo", create_step_control));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Simulation::setup()
+{
+  const DM dm = model_.dm();
+
+  PetscFunctionBeginUser;
+  PetscCall(DMCreateGlobalVector(dm, state_.out()));
+  PetscCall(DMCreateLocalVector(dm, local_.out()));
+  PetscCall(VecDuplicate(local_, rate_.out()));
+  PetscCall(VecDuplicate(local_, local_residual_.out()));
+  PetscCall(VecDuplicate(local_, before_.out()));
+  PetscCall(create_solver());
+  phases_ = phases();
+  end_ = phases_.back().end;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Simulation::create_solver()
+{
+  const MPI_Comm comm = options_.comm();
+  SNES snes;
+  KSP ksp;
+  PC pc;
+  TSAdapt adapt;
+  PetscBool is_beuler, has_pc, is_fieldsplit = PETSC_FALSE;
+  char pc_type[64] = "";
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscOptionsGetString(nullptr, nullptr, "-pc_type", pc_type, sizeof(pc_type), &has_pc));
+  PulmoUserCheck(has_pc, comm,
+                 "no linear solver: give a solver file, e.g. -options_file petsc_options/solvers/direct.opts (or -pc_type)");
+  PetscCall(PetscStrcmp(pc_type, PCFIELDSPLIT, &is_fieldsplit));
+
+  PetscCall(TSCreate(comm, ts_.out()));
+  PetscCall(TSSetDM(ts_, model_.dm()));
+  PetscCall(TSSetApplicationContext(ts_, this));
+  PetscCall(TSSetIFunction(ts_, nullptr, ifunction, this));
+  PetscCall(DMCreateMatrix(model_.dm(), matrix_.out()));
+  PetscCall(TSSetIJacobian(ts_, matrix_, matrix_, ijacobian, this));
+  PetscCall(TSSetProblemType(ts_, TS_NONLINEAR));
+  PetscCall(TSSetType(ts_, TSBEULER));
+  PetscCall(TSSetTimeStep(ts_, wanted_dt_));
+  PetscCall(TSSetMaxTime(ts_, PETSC_MAX_REAL));
+  PetscCall(TSSetMaxSteps(ts_, PETSC_MAX_INT));
+  PetscCall(TSSetExactFinalTime(ts_, TS_EXACTFINALTIME_MATCHSTEP));
+  PetscCall(TSSetMaxSNESFailures(ts_, -1));
+  PetscCall(TSSetErrorIfStepFails(ts_, PETSC_FALSE));
+  PetscCall(TSSetPostStage(ts_, post_stage));
+  PetscCall(TSSetPostStep(ts_, post_step));
+  PetscCall(TSGetAdapt(ts_, &adapt));
+  PetscCall(TSAdaptSetType(adapt, "pulmo"));
+  PetscCall(TSAdaptSetClip(adapt, 0.1, 2.0));
+  PetscCall(TSAdaptSetCheckStage(adapt, check_stage));
+  PetscCall(TSGetSNES(ts_, &snes));
+  PetscCall(SNESGetKSP(snes, &ksp));
+  if (is_fieldsplit && !scene_.facts().airflow) {
+    // one field: what a solver file says of the displacement split preconditions the whole
+    PetscCall(KSPGetPC(ksp, &pc));
+    PetscCall(PCSetOptionsPrefix(pc, "fieldsplit_displacement_"));
+  }
+  PetscCall(TSSetFromOptions(ts_));
+  PetscCall(TSGetTimeStep(ts_, &wanted_dt_));
+  PulmoUserCheck(wanted_dt_ > 0, comm, "-ts_dt %g s must be positive", (double)wanted_dt_);
+  PetscCall(PetscObjectTypeCompare((PetscObject)(TS)ts_, TSBEULER, &is_beuler));
+  PulmoUserCheck(is_beuler, comm,
+                 "-ts_type: the conservative rate of porosity is exact for backward Euler only; use -ts_type beuler");
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+std::vector<Phase> Simulation::phases() const
+{
+  PetscReal max_time = PETSC_MAX_REAL;
+  std::vector<Phase> list;
+
+  (void)TSGetMaxTime(ts_, &max_time);
+  if (scene_.facts().ventilator) list = scene_.facts().ventilator->phases();
+  else list.push_back({"run", 0, 0, max_time < PETSC_MAX_REAL ? max_time : 1, 0, 0, 0});
+  while (list.size() > 1 && list.back().begin >= max_time) list.pop_back();
+  list.back().end = std::min(list.back().end, max_time);
+  return list;
+}
+
+PetscReal Simulation::landing(PetscReal t) const
+{
+  const PetscReal tolerance = same_time * wanted_dt_;
+  for (const PetscReal stop : {phase_->begin + phase_->ramp, phase_->end})
+    if (t < stop - tolerance && t + dt_ > stop - tolerance) return stop - t;
+  return dt_;
+}
+
+PetscReal Simulation::next_step(PetscReal t, PetscReal h, PetscReal growth)
+{
+  if (!failures_.empty()) dt_ = h;                                              // it took cuts to get here
+  else if (h >= dt_ * (1 - same_time)) dt_ = std::min(wanted_dt_, growth * dt_); // a full step: grow back
+  return landing(t);
+}
+
+PetscErrorCode Simulation::run(bool &finished)
+{
+  const MPI_Comm comm = options_.comm();
+  Measures measures;
+  PetscLogDouble start, end;
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscTime(&start));
+  PetscCall(VecZeroEntries(state_));
+  PetscCall(DMGlobalToLocal(model_.dm(), state_, INSERT_VALUES, before_));
+  PetscCall(model_.measure(before_, measures));
+  accepted_ = SignalRow();
+  accepted_.phase = phases_.front().name;
+  accepted_.breath = static_cast<int>(phases_.front().breath);
+  accepted_.pressure = phases_.front().from / units::kPa_per_cmH2O;
+  PetscCall(report(accepted_, measures));
+
+  finished = true;
+  dt_ = wanted_dt_;
+  for (const Phase &phase : phases_) {
+    TSConvergedReason reason;
+    phase_ = &phase;
+    PetscCall(TSSetTime(ts_, phase.begin));
+    PetscCall(TSSetMaxTime(ts_, phase.end));
+    PetscCall(TSSetTimeStep(ts_, landing(phase.begin)));
+    PetscCall(TSSolve(ts_, state_));
+    PetscCall(TSGetConvergedReason(ts_, &reason));
+    if (reason < 0) {
+      finished = false;
+      break;
+    }
+  }
+  PetscCall(PetscTime(&end));
+  seconds_.total = end - start + seconds_.setup;
+  seconds_.solve = end - start - seconds_.residual - seconds_.jacobian - seconds_.output;
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &seconds_, 6, MPI_DOUBLE, MPI_MAX, comm));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Fills local_ and rate_ from global vectors at time t.
+PetscErrorCode Simulation::scatter(PetscReal t, Vec X, Vec Xdot)
+{
+  PetscReal dt;
+
+  PetscFunctionBeginUser;
+  PetscCall(TSGetTimeStep(ts_, &dt));
+  PetscCall(model_.set_step(dt, scene_.facts().airway_pressure(t)));
+  PetscCall(DMGlobalToLocal(model_.dm(), X, INSERT_VALUES, local_));
+  PetscCall(DMGlobalToLocal(model_.dm(), Xdot, INSERT_VALUES, rate_));
+  PetscCall(model_.constrain(t, local_));
+  PetscCall(model_.constrain_rate(local_, before_, dt, rate_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Simulation::residual(PetscReal t, Vec X, Vec Xdot, Vec F)
+{
+  const Stopwatch clock(seconds_.residual);
+  Measures measures;
+
+  PetscFunctionBeginUser;
+  PetscCall(scatter(t, X, Xdot));
+  PetscCall(model_.measure(local_, measures));
+  if (!(measures.min_J_points > 0)) {
+    SNES snes;
+    inverted_ = true;
+    inverted_measures_ = measures;
+    PetscCall(TSGetSNES(ts_, &snes));
+    PetscCall(SNESSetFunctionDomainError(snes));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+  PetscCall(model_.residual(t, local_, rate_, local_residual_));
+  PetscCall(VecZeroEntries(F));
+  PetscCall(DMLocalToGlobal(model_.dm(), local_residual_, ADD_VALUES, F));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Simulation::jacobian(PetscReal t, Vec X, Vec Xdot, PetscReal shift, Mat A)
+{
+  const Stopwatch clock(seconds_.jacobian);
+
+  PetscFunctionBeginUser;
+  PetscCall(scatter(t, X, Xdot));
+  PetscCall(model_.jacobian(t, local_, rate_, shift, A));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Simulation::after_stage()
+{
+  SNES snes;
+  SNESConvergedReason reason;
+  PetscInt newton, krylov;
+
+  PetscFunctionBeginUser;
+  PetscCall(TSGetSNES(ts_, &snes));
+  PetscCall(SNESGetIterationNumber(snes, &newton));
+  PetscCall(SNESGetLinearSolveIterations(snes, &krylov));
+  PetscCall(SNESGetConvergedReason(snes, &reason));
+  newton_ += newton;
+  krylov_ += krylov;
+  if (reason < 0) {
+    PetscReal dt;
+    PetscCall(TSGetTimeStep(ts_, &dt));
+    failures_.push_back({accepted_.time, dt, SNESConvergedReasons[reason], newton, inverted_measures_, inverted_});
+    ++rejected_;
+  }
+  inverted_ = false;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Simulation::accept_stage(Vec X, PetscBool *accept)
+{
+  Measures measures;
+  PetscReal t, dt;
+
+  PetscFunctionBeginUser;
+  PetscCall(TSGetTime(ts_, &t));
+  PetscCall(TSGetTimeStep(ts_, &dt));
+  PetscCall(DMGlobalToLocal(model_.dm(), X, INSERT_VALUES, local_));
+  PetscCall(model_.constrain(t + dt, local_));
+  PetscCall(model_.measure(local_, measures));
+  *accept = PetscBool(measures.min_J > 0);
+  if (!*accept) {
+    failures_.push_back({t, dt, "converged to a state with J <= 0", 0, measures, true});
+    ++rejected_;
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Simulation::after_step()
+{
+  Measures measures;
+  PetscReal t;
+  SignalRow row;
+
+  PetscFunctionBeginUser;
+  PetscCall(TSGetTime(ts_, &t));
+  row.dt = t - accepted_.time;
+  failures_.clear();
+
+  // state and consistent flux of the accepted step
+  PetscCall(model_.set_step(row.dt, scene_.facts().airway_pressure(t)));
+  PetscCall(DMGlobalToLocal(model_.dm(), state_, INSERT_VALUES, local_));
+  PetscCall(model_.constrain(t, local_));
+  PetscCall(VecWAXPY(rate_, -1, before_, local_));
+  PetscCall(VecScale(rate_, 1 / row.dt));
+  PetscCall(model_.measure(local_, measures));
+  row.volume = measures.volume_change / units::mm3_per_ml;
+  if (scene_.facts().airflow) {
+    PetscReal flow;
+    PetscCall(model_.residual(t, local_, rate_, local_residual_));
+    PetscCall(model_.airway_flow(local_residual_, flow));
+    row.flow = flow / units::mm3_per_ml;
+  } else {
+    row.flow = (row.volume - accepted_.volume) / row.dt;
+  }
+  PetscCall(VecCopy(local_, before_));
+  row.time = t;
+  row.pressure = scene_.facts().airway_pressure(t) / units::kPa_per_cmH2O;
+  row.phase = phase_->name;
+  row.breath = static_cast<int>(phase_->breath);
+  row.newton = newton_;
+  row.krylov = krylov_;
+  row.min_J = measures.min_J;
+  row.max_J = measures.max_J;
+  newton_ = krylov_ = 0;
+  delivered_ += row.dt * row.flow * units::mm3_per_ml;
+  accepted_ = row;
+  PetscCall(report(row, measures));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Simulation::report(const SignalRow &row, const Measures &measures)
+{
+  const Stopwatch clock(seconds_.output);
+  const PetscReal balance = measures.volume_change - delivered_;
+
+  PetscFunctionBeginUser;
+  rows_.push_back(row);
+  worst_balance_ = std::max(worst_balance_, std::abs(balance));
+  min_J_ = std::min(min_J_, measures.min_J);
+  const bool phase_ends = phase_ && std::abs(row.time - phase_->end) <= same_time * wanted_dt_;
+  const StepReport step{row, measures, balance, before_, end_, phase_ends};
+  for (Observer *observer : observers_) PetscCall(observer->observe(step));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+std::string Simulation::failure_text() const
+{
+  std::ostringstream text;
+  text.precision(6);
+  text << "no step could be accepted after t = " << accepted_.time << " s (phase " << (phase_ ? phase_->name : "run")
+       << ", airway pressure " << accepted_.pressure << " cmH2O, volume " << accepted_.volume << " ml, tissue law "
+       << scene_.tissue().law().name() << ", smallest J " << accepted_.min_J << ").";
+  const auto inverted = std::find_if(failures_.rbegin(), failures_.rend(), [](const auto &f) { return f.inverted; });
+  if (inverted != failures_.rend())
+    text << " The tissue turned inside out: J = " << inverted->measures.min_J << " in the cell at ("
+         << inverted->measures.where[0] << ", " << inverted->measures.where[1] << ", " << inverted->measures.where[2]
+         << ") mm (cell " << inverted->measures.cell << " of rank " << inverted->measures.rank << ").";
+  text << " Tried:";
+  for (const FailedAttempt &f : failures_)
+    text << " dt " << f.dt << " s: " << f.reason << (f.inverted ? " (J <= 0 met)" : "") << " after " << f.newton
+         << " Newton steps;";
+  text << " what to try: ";
+  if (inverted != failures_.rend())
+    text << "-lumen_pressure if that cell is at the airway, a finer mesh there, a slower -ventilator_ramp, another "
+            "-tissue; the law may have no equilibrium at this pressure.";
+  else
+    text << "petsc_options/solvers/direct.opts, a smaller -ts_dt, a larger -snes_max_it, a slower -ventilator_ramp; "
+            "-snes_monitor and -ksp_monitor show where it stalls; the law may have no equilibrium at this pressure.";
+  return text.str();
+}
+
+} // namespace pulmo
