@@ -48,66 +48,80 @@ PetscErrorCode initialize()
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+Run::Run(const Registry &registry)
+    : options_(PETSC_COMM_WORLD), scene_(registry), simulation_(options_, scene_, model_)
+{
+}
+
+PetscErrorCode Run::declare()
+{
+  PetscFunctionBeginUser;
+  PetscCall(scene_.declare(options_));
+  PetscCall(model_.declare(options_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Run::setup()
+{
+  PetscLogDouble start, end;
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscTime(&start));
+  PetscCall(options_.check_unknown());
+  PetscCall(scene_.prepare(options_));
+  Composition composition(scene_.mesh());
+  PetscCall(scene_.compose(composition));
+  PetscCall(model_.build(std::move(composition), reference_modulus(scene_.tissue().law())));
+  PetscCall(simulation_.setup());
+  PetscCall(PetscTime(&end));
+  simulation_.setup_took(end - start);
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode run(const Registry &registry, bool &finished)
 {
   const MPI_Comm comm = PETSC_COMM_WORLD;
-  Options options(comm);
-  Scene scene(registry);
-  Model model;
+  Run run(registry);
+  Options &options = run.options();
+  const Scene &scene = run.scene();
+  Simulation &simulation = run.simulation();
   Output output;
   bool view_effects = false;
   PetscBool help, has_mesh;
-  PetscLogDouble start, built;
 
   PetscFunctionBeginUser;
   finished = false;
-  PetscCall(PetscTime(&start));
-  PetscCall(scene.declare(options));
-  PetscCall(model.declare(options));
+  PetscCall(run.declare());
   PetscCall(output.declare(options));
   options.group("effects", "ledger");
   PetscCall(options.flag("view", "print effects, fields, terms, blocks and seconds at the end", view_effects));
   PetscCall(PetscOptionsHasHelp(nullptr, &help));
+  PetscCall(PetscOptionsHasName(nullptr, nullptr, "-dm_plex_filename", &has_mesh));
+  if (help) PetscCall(options.print_help());
+  if (!help || has_mesh) PetscCall(run.setup()); // with -help PETSc lists what it reads for this scene
   if (help) {
-    PetscCall(options.print_help());
-    PetscCall(PetscOptionsHasName(nullptr, nullptr, "-dm_plex_filename", &has_mesh));
-    finished = !has_mesh;
-    if (!has_mesh) PetscFunctionReturn(PETSC_SUCCESS);
-  }
-  PetscCall(options.check_unknown());
-  PetscCall(scene.prepare(options));
-
-  Composition composition(scene.mesh());
-  PetscCall(scene.compose(composition));
-  PetscCall(model.build(std::move(composition), reference_modulus(scene.tissue().law())));
-
-  Simulation simulation(options, scene, model);
-  PetscCall(simulation.setup());
-  if (help) { // PETSc has printed what it reads for this scene
     finished = true;
     PetscFunctionReturn(PETSC_SUCCESS);
   }
   PetscCall(output.prepare(options));
-  PetscCall(PetscTime(&built));
-  simulation.setup_took(built - start);
 
   SignalWriter signals(comm, output, scene.facts());
   ProgressPrinter progress(comm, scene.facts());
-  FieldWriter fields(output, scene, model);
+  FieldWriter fields(output, scene, run.model());
   simulation.add(signals);
   simulation.add(fields);
   if (output.progress()) simulation.add(progress);
   PetscCall(simulation.run(finished));
   PetscCall(options.warn_unused());
-  if (view_effects) PetscCall(print_ledger(comm, scene, model, simulation.seconds()));
+  if (view_effects) PetscCall(print_ledger(comm, scene, run.model(), simulation.seconds()));
   if (!finished) {
     PetscCall(fields.snapshot(simulation.time(), simulation.local_state()));
-    PetscCall(write_summary(options, output, scene, model, simulation, false));
+    PetscCall(write_summary(options, output, scene, run.model(), simulation, false));
     PulmoUserError(comm, "%s The last good state and the signals so far are in %s.", simulation.failure_text().c_str(),
                    output.directory().c_str());
   }
   PetscCall(signals.finish());
-  PetscCall(write_summary(options, output, scene, model, simulation, true));
+  PetscCall(write_summary(options, output, scene, run.model(), simulation, true));
   PetscCall(print_numbers(comm, output, scene, simulation));
   PetscFunctionReturn(PETSC_SUCCESS);
 }

@@ -2,7 +2,7 @@
 /// The program as a function: what main() does after PetscInitialize. Tests call it with registries of their own.
 #pragma once
 
-#include "pulmo/registry.hpp"
+#include "pulmo/simulation.hpp"
 
 namespace pulmo {
 
@@ -10,8 +10,31 @@ namespace pulmo {
 /// sentence. Call once after PetscInitialize.
 PetscErrorCode initialize();
 
-/// Runs the scene of the options database. @p finished tells whether the run reached its end; user errors come
-/// back as PETSC_ERR_USER_INPUT, already printed.
+/// A scene made ready to run: options read and checked, mesh, model and solvers built, nothing written yet.
+/// Options come from PETSc's default database.
+class Run {
+public:
+  explicit Run(const Registry &registry);
+
+  /// Declares the options; with -help lists them.
+  PetscErrorCode declare();
+  /// Checks the options and builds everything.
+  PetscErrorCode setup();
+
+  Options &options() { return options_; }
+  const Scene &scene() const { return scene_; }
+  Model &model() { return model_; }
+  Simulation &simulation() { return simulation_; }
+
+private:
+  Options options_;
+  Scene scene_;
+  Model model_;
+  Simulation simulation_;
+};
+
+/// Runs the scene of the options database and writes its output. @p finished tells whether the run reached its
+/// end; user errors come back as PETSC_ERR_USER_INPUT, already printed.
 PetscErrorCode run(const Registry &registry, bool &finished);
 
 } // namespace pulmo
