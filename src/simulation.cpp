@@ -349,8 +349,11 @@ PetscErrorCode Simulation::after_step()
   Measures measures;
   PetscReal t;
   SignalRow row;
+  TSConvergedReason reason;
 
   PetscFunctionBeginUser;
+  PetscCall(TSGetConvergedReason(ts_, &reason));
+  if (reason < 0) PetscFunctionReturn(PETSC_SUCCESS); // PETSc calls this after a step that it gave up, too
   PetscCall(TSGetTime(ts_, &t));
   row.dt = t - accepted_.time;
   failures_.clear();
