@@ -2,9 +2,9 @@
 
 #include "pulmo/units.hpp"
 
-#include <petsc/private/tsimpl.h>
 #include <algorithm>
 #include <cmath>
+#include <petsc/private/tsimpl.h>
 #include <sstream>
 
 namespace pulmo {
@@ -81,8 +81,8 @@ PetscErrorCode check_stage(TSAdapt, TS ts, PetscReal, Vec X, PetscBool *accept)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode choose_step(TSAdapt adapt, TS ts, PetscReal h, PetscInt *next_scheme, PetscReal *next_h, PetscBool *accept,
-                           PetscReal *wlte, PetscReal *wltea, PetscReal *wlter)
+PetscErrorCode choose_step(TSAdapt adapt, TS ts, PetscReal h, PetscInt *next_scheme, PetscReal *next_h,
+                           PetscBool *accept, PetscReal *wlte, PetscReal *wltea, PetscReal *wlter)
 {
   Simulation *simulation;
 
@@ -139,8 +139,9 @@ PetscErrorCode Simulation::create_solver()
 
   PetscFunctionBeginUser;
   PetscCall(PetscOptionsGetString(nullptr, nullptr, "-pc_type", pc_type, sizeof(pc_type), &has_pc));
-  PulmoUserCheck(has_pc, comm,
-                 "no linear solver: give a solver file, e.g. -options_file petsc_options/solvers/direct.opts (or -pc_type)");
+  PulmoUserCheck(
+      has_pc, comm,
+      "no linear solver: give a solver file, e.g. -options_file petsc_options/solvers/direct.opts (or -pc_type)");
   PetscCall(PetscStrcmp(pc_type, PCFIELDSPLIT, &is_fieldsplit));
 
   PetscCall(TSCreate(comm, ts_.out()));
@@ -185,8 +186,10 @@ std::vector<Phase> Simulation::phases() const
   std::vector<Phase> list;
 
   (void)TSGetMaxTime(ts_, &max_time);
-  if (scene_.facts().ventilator) list = scene_.facts().ventilator->phases();
-  else list.push_back({"run", 0, 0, max_time < PETSC_MAX_REAL ? max_time : 1, 0, 0, 0});
+  if (scene_.facts().ventilator)
+    list = scene_.facts().ventilator->phases();
+  else
+    list.push_back({"run", 0, 0, max_time < PETSC_MAX_REAL ? max_time : 1, 0, 0, 0});
   while (list.size() > 1 && list.back().begin >= max_time) list.pop_back();
   list.back().end = std::min(list.back().end, max_time);
   return list;
@@ -202,8 +205,10 @@ PetscReal Simulation::landing(PetscReal t) const
 
 PetscReal Simulation::next_step(PetscReal t, PetscReal h, PetscReal growth)
 {
-  if (!failures_.empty()) dt_ = h;                                              // it took cuts to get here
-  else if (h >= dt_ * (1 - same_time)) dt_ = std::min(wanted_dt_, growth * dt_); // a full step: grow back
+  if (!failures_.empty())
+    dt_ = h; // it took cuts to get here
+  else if (h >= dt_ * (1 - same_time))
+    dt_ = std::min(wanted_dt_, growth * dt_); // a full step: grow back
   return landing(t);
 }
 
@@ -331,7 +336,8 @@ PetscErrorCode Simulation::accept_stage(Vec X, PetscBool *accept)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Simulation::reject(PetscReal dt, const std::string &reason, PetscInt newton, const Measures &measures, bool inverted)
+PetscErrorCode Simulation::reject(PetscReal dt, const std::string &reason, PetscInt newton, const Measures &measures,
+                                  bool inverted)
 {
   TSAdapt adapt;
 
@@ -340,7 +346,8 @@ PetscErrorCode Simulation::reject(PetscReal dt, const std::string &reason, Petsc
   ++rejected_;
   PetscCall(TSGetAdapt(ts_, &adapt));
   const PetscReal next = dt * adapt->scale_solve_failed;
-  if (next < std::max(adapt->dt_min, least_step * wanted_dt_)) PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
+  if (next < std::max(adapt->dt_min, least_step * wanted_dt_))
+    PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -24,9 +24,9 @@
 #define PulmoUserError(comm, ...) SETERRQ(comm, PETSC_ERR_USER_INPUT, __VA_ARGS__)
 
 /// PulmoUserError unless @p condition holds.
-#define PulmoUserCheck(condition, comm, ...)                              \
-  do {                                                                    \
-    if (PetscUnlikely(!(condition))) PulmoUserError(comm, __VA_ARGS__);   \
+#define PulmoUserCheck(condition, comm, ...)                                                                           \
+  do {                                                                                                                 \
+    if (PetscUnlikely(!(condition))) PulmoUserError(comm, __VA_ARGS__);                                                \
   } while (0)
 
 namespace pulmo {
