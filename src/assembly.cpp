@@ -297,8 +297,8 @@ PetscErrorCode Assembly::jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, 
                             PetscScalar *matrices) -> PetscErrorCode {
     PetscFunctionBeginUser;
     for (PetscInt pair = 0; pair < n_fields_ * n_fields_; ++pair)
-      PetscCall(PetscFEIntegrateJacobian(ds_, PETSCFE_JACOBIAN, {nullptr, 0, pair, 0}, n, geom, u, u_t, nullptr,
-                                         nullptr, t, shift, matrices));
+      PetscCall(compat::integrate_jacobian(PetscFEIntegrateJacobian, ds_, {nullptr, 0, pair, 0}, n, geom, u, u_t, t,
+                                           shift, matrices));
     PetscFunctionReturn(PETSC_SUCCESS);
   };
   const auto on_facets = [&](const Facets &facets, PetscInt n, PetscFEGeom *geom, const PetscScalar *u,
@@ -307,7 +307,8 @@ PetscErrorCode Assembly::jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, 
     for (PetscInt trial = 0; trial < n_fields_; ++trial) {
       PetscFormKey key = facets.key;
       key.field = facets.key.field * n_fields_ + trial;
-      PetscCall(PetscFEIntegrateBdJacobian(ds_, facets.wf, key, n, geom, u, u_t, nullptr, nullptr, t, shift, matrices));
+      PetscCall(compat::integrate_bd_jacobian(PetscFEIntegrateBdJacobian, ds_, facets.wf, key, n, geom, u, u_t, t,
+                                              shift, matrices));
     }
     PetscFunctionReturn(PETSC_SUCCESS);
   };

@@ -668,6 +668,24 @@ PetscErrorCode integrate_surface_jacobian(PetscDS ds, PetscWeakForm wf, PetscFor
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+// The same with the arguments of newer releases of PETSc: assigning to fe->ops takes the overload that fits.
+[[maybe_unused]] PetscErrorCode integrate_jacobian(PetscDS ds, PetscDS, PetscFEJacobianType type, PetscFormKey key,
+                                                   PetscInt Ne, PetscFEGeom *geom, const PetscScalar u[],
+                                                   const PetscScalar u_t[], PetscDS aux, const PetscScalar a[],
+                                                   PetscReal t, PetscReal shift, PetscScalar matrices[])
+{
+  return integrate_jacobian(ds, type, key, Ne, geom, u, u_t, aux, a, t, shift, matrices);
+}
+
+[[maybe_unused]] PetscErrorCode integrate_surface_jacobian(PetscDS ds, PetscWeakForm wf, PetscFEJacobianType,
+                                                           PetscFormKey key, PetscInt Ne, PetscFEGeom *geom,
+                                                           const PetscScalar u[], const PetscScalar u_t[], PetscDS aux,
+                                                           const PetscScalar a[], PetscReal t, PetscReal shift,
+                                                           PetscScalar matrices[])
+{
+  return integrate_surface_jacobian(ds, wf, key, Ne, geom, u, u_t, aux, a, t, shift, matrices);
+}
+
 PetscErrorCode create_fe(PetscFE fe)
 {
   PetscFunctionBeginUser;
