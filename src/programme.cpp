@@ -1,6 +1,7 @@
 #include "pulmo/programme.hpp"
 
 #include <algorithm>
+#include <cmath>
 
 namespace pulmo {
 
