@@ -272,20 +272,21 @@ TEST(Traction, IsADeadLoadPerReferenceArea)
   });
 }
 
+struct A {
+  static constexpr const char *owner = "a";
+  PetscScalar one, two;
+};
+struct B {
+  static constexpr const char *owner = "b";
+  PetscScalar three;
+};
+struct C {
+  static constexpr const char *owner = "c";
+  PetscScalar absent;
+};
+
 TEST(Constants, EveryOwnerFindsItsOwnBlock)
 {
-  struct A {
-    static constexpr const char *owner = "a";
-    PetscScalar one, two;
-  };
-  struct B {
-    static constexpr const char *owner = "b";
-    PetscScalar three;
-  };
-  struct C {
-    static constexpr const char *owner = "c";
-    PetscScalar absent;
-  };
   const PetscScalar c[] = {2, constants::tag("b"), 5, constants::tag("a"), 6, 3, 1, 2};
   EXPECT_EQ(constants::get<A>(c).one, 1);
   EXPECT_EQ(constants::get<A>(c).two, 2);
