@@ -318,13 +318,14 @@ PetscErrorCode Options::warn_unused() const
 
 PetscErrorCode Options::print_help() const
 {
-  std::size_t last = groups_.size();
+  std::string last;
 
   PetscFunctionBeginUser;
   PetscCall(PetscPrintf(comm_, "pulmo's own options (beside PETSc's: -dm_plex_filename, -ts_*, -snes_*, -ksp_*, -pc_*):\n"));
   for (const Declared &d : declared_) {
-    if (d.group != last) PetscCall(PetscPrintf(comm_, "\n%s\n", groups_[d.group].about.c_str()));
-    last = d.group;
+    const std::string &about = groups_[d.group].about;
+    if (about != last) PetscCall(PetscPrintf(comm_, "\n%s\n", about.c_str()));
+    last = about;
     PetscCall(PetscPrintf(comm_, "  %-34s %s [%s]%s (default %s)\n", d.name.c_str(), d.help.c_str(), d.unit.c_str(),
                           d.range.empty() || d.range == "any" ? "" : (" " + d.range).c_str(),
                           d.value.empty() ? "none" : d.value.c_str()));

@@ -103,6 +103,9 @@ PetscErrorCode run(const Registry &registry, bool &finished)
     finished = true;
     PetscFunctionReturn(PETSC_SUCCESS);
   }
+  PulmoUserCheck(run.model().composition().held(), comm,
+                 "nothing holds the lung in place: give -chest_wall (springs), or -support -support_rigid to let it move "
+                 "freely but for the six rigid-body motions");
   PetscCall(output.prepare(options));
 
   SignalWriter signals(comm, output, scene.facts());

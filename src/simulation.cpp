@@ -14,6 +14,9 @@ namespace {
 /// Two times closer than this share of the step are the same.
 constexpr PetscReal same_time = 1e-9;
 
+/// A step cut below this share of the one asked for ends the run (-ts_adapt_dt_min may end it earlier).
+constexpr PetscReal least_step = 1e-6;
+
 class Stopwatch {
 public:
   explicit Stopwatch(double &seconds) : seconds_(seconds) { (void)PetscTime(&start_); }
@@ -306,8 +309,7 @@ PetscErrorCode Simulation::after_stage()
   if (reason < 0) {
     PetscReal dt;
     PetscCall(TSGetTimeStep(ts_, &dt));
-    failures_.push_back({accepted_.time, dt, SNESConvergedReasons[reason], newton, inverted_measures_, inverted_});
-    ++rejected_;
+    PetscCall(reject(dt, SNESConvergedReasons[reason], newton, inverted_measures_, inverted_));
   }
   inverted_ = false;
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -325,10 +327,20 @@ PetscErrorCode Simulation::accept_stage(Vec X, PetscBool *accept)
   PetscCall(model_.constrain(t + dt, local_));
   PetscCall(model_.measure(local_, measures));
   *accept = PetscBool(measures.min_J > 0);
-  if (!*accept) {
-    failures_.push_back({t, dt, "converged to a state with J <= 0", 0, measures, true});
-    ++rejected_;
-  }
+  if (!*accept) PetscCall(reject(dt, "converged to a state with J <= 0", 0, measures, true));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Simulation::reject(PetscReal dt, const std::string &reason, PetscInt newton, const Measures &measures, bool inverted)
+{
+  TSAdapt adapt;
+
+  PetscFunctionBeginUser;
+  failures_.push_back({accepted_.time, dt, reason, newton, measures, inverted});
+  ++rejected_;
+  PetscCall(TSGetAdapt(ts_, &adapt));
+  const PetscReal next = dt * adapt->scale_solve_failed;
+  if (next < std::max(adapt->dt_min, least_step * wanted_dt_)) PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -337,8 +349,11 @@ PetscErrorCode Simulation::after_step()
   Measures measures;
   PetscReal t;
   SignalRow row;
+  TSConvergedReason reason;
 
   PetscFunctionBeginUser;
+  PetscCall(TSGetConvergedReason(ts_, &reason));
+  if (reason < 0) PetscFunctionReturn(PETSC_SUCCESS); // PETSc calls this after a step that it gave up, too
   PetscCall(TSGetTime(ts_, &t));
   row.dt = t - accepted_.time;
   failures_.clear();

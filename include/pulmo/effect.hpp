@@ -126,6 +126,16 @@ public:
     constraints_.push_back(std::move(c));
   }
 
+  /// Whether anything holds the lung in place: prescribed displacement, or a term that resists displacement itself.
+  bool held() const
+  {
+    for (const Constraint &c : constraints_)
+      if (c.field == displacement) return true;
+    for (const Term &t : terms_)
+      if (t.test == displacement && t.trial == displacement && (t.g0 || t.bd_g0)) return true;
+    return false;
+  }
+
   const std::vector<FieldSpec> &fields() const { return fields_; }
   const std::vector<Term> &terms() const { return terms_; }
   const std::vector<Constraint> &constraints() const { return constraints_; }

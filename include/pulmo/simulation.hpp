@@ -78,6 +78,8 @@ private:
   /// Step size from time @p t, shortened to land on the end of the ramp or of the phase.
   PetscReal landing(PetscReal t) const;
   PetscErrorCode scatter(PetscReal t, Vec X, Vec Xdot);
+  /// Notes an attempt that failed; ends the run if the next one would be too short.
+  PetscErrorCode reject(PetscReal dt, const std::string &reason, PetscInt newton, const Measures &measures, bool inverted);
   PetscErrorCode report(const SignalRow &row, const Measures &measures);
   std::vector<Phase> phases() const;
 
