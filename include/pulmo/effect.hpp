@@ -45,9 +45,9 @@ struct Constraint {
   std::string effect, name;
   PetscInt field = displacement;
   bool component[3] = {false, false, false};
-  std::string surface;                ///< empty: at @p vertices
-  std::vector<PetscInt> vertices;     ///< local mesh points (on every rank that has them)
-  bool at_airway = false;             ///< the condition that the ventilator steers
+  std::string surface;            ///< empty: at @p vertices
+  std::vector<PetscInt> vertices; ///< local mesh points (on every rank that has them)
+  bool at_airway = false;         ///< the condition that the ventilator steers
   /// Value of all components at time t (s) and material point x (mm).
   std::function<void(PetscReal t, const PetscReal x[3], PetscScalar value[3])> value;
 };

@@ -94,8 +94,10 @@ PetscErrorCode measure(const char *type, PetscInt repeats, Result &result, Petsc
   PetscCall(smooth_state(run, local, rate));
   PetscCall(model.set_step(dt, 0.3));
   PetscCall(DMCreateMatrix(model.dm(), result.matrix.out()));
-  PetscCall(median_seconds(repeats, [&] { return model.residual(dt, local, rate, result.vector); }, result.residual));
-  PetscCall(median_seconds(repeats, [&] { return model.jacobian(dt, local, rate, 1 / dt, result.matrix); }, result.jacobian));
+  PetscCall(median_seconds(
+      repeats, [&] { return model.residual(dt, local, rate, result.vector); }, result.residual));
+  PetscCall(median_seconds(
+      repeats, [&] { return model.jacobian(dt, local, rate, 1 / dt, result.matrix); }, result.jacobian));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
