@@ -5,8 +5,10 @@
 #include "pulmo/effects/ventilator.hpp"
 #include "pulmo/units.hpp"
 
-namespace pulmo::test {
-namespace {
+namespace pulmo::test
+{
+namespace
+{
 
 // ---------------------------------------------------------------------------------------------------- programme
 
@@ -64,8 +66,8 @@ TEST(Programme, PeepSettlesFirstAndBreathsFollowWithoutGaps)
   const Programme p = programme_of("-ventilator_pip 15 -ventilator_peep 5 -ventilator_pause 0.4 -ventilator_breaths 3"
                                    " -ventilator_inspiration 0.8 -ventilator_expiration 1.6 -ventilator_ramp 0.2"
                                    " -ventilator_ramp_down 0.3");
-  const char *names[] = {"settle",     "inspiration", "pause",      "expiration",  "inspiration",
-                         "pause",      "expiration",  "inspiration", "pause",      "expiration"};
+  const char *names[] = {"settle", "inspiration", "pause",       "expiration", "inspiration",
+                         "pause",  "expiration",  "inspiration", "pause",      "expiration"};
   ASSERT_EQ(p.phases().size(), 10u);
   double t = 0;
   for (std::size_t i = 0; i < 10; ++i) {
@@ -80,11 +82,11 @@ TEST(Programme, PeepSettlesFirstAndBreathsFollowWithoutGaps)
   }
   EXPECT_NEAR(p.end(), 0.2 + 1.6 + 3 * 2.8, 1e-12);
   const double k = 0.0980665;
-  EXPECT_DOUBLE_EQ(p.phases()[0].end, 1.8);          // ramp and one expiration
-  EXPECT_NEAR(p.pressure(0.1), 2.5 * k, 1e-14);      // settle's ramp
+  EXPECT_DOUBLE_EQ(p.phases()[0].end, 1.8);     // ramp and one expiration
+  EXPECT_NEAR(p.pressure(0.1), 2.5 * k, 1e-14); // settle's ramp
   EXPECT_NEAR(p.pressure(1.8), 5 * k, 1e-14);
-  EXPECT_NEAR(p.pressure(1.9), 10 * k, 1e-14);       // half of the ramp
-  EXPECT_NEAR(p.pressure(2.8), 15 * k, 1e-14);       // pause
+  EXPECT_NEAR(p.pressure(1.9), 10 * k, 1e-14);        // half of the ramp
+  EXPECT_NEAR(p.pressure(2.8), 15 * k, 1e-14);        // pause
   EXPECT_NEAR(p.pressure(3.0 + 0.15), 10 * k, 1e-12); // ramp down
   EXPECT_NEAR(p.pressure(p.end()), 5 * k, 1e-14);
 }
@@ -112,7 +114,8 @@ std::vector<SignalRow> compartment(double E, double R, double peep, int breaths,
   add(0, rest_volume, 0, breaths > 0 ? "inspiration" : "settle", 0);
   for (int b = 1; b <= breaths; ++b, t0 += inspiration + expiration)
     for (int part = 0; part < 2; ++part) {
-      const double T = part == 0 ? inspiration : expiration, begin = part == 0 ? t0 : t0 + inspiration, sign = part == 0 ? 1 : -1;
+      const double T = part == 0 ? inspiration : expiration, begin = part == 0 ? t0 : t0 + inspiration,
+                   sign = part == 0 ? 1 : -1;
       for (double t = 0; t < T;) {
         t = std::min(T, t + random(0.01, 0.09));
         const double a = M_PI * t / T, lung = tidal / 2 * (1 - std::cos(a));
@@ -230,9 +233,14 @@ std::vector<SignalRow> breath_with_pause()
     double t, P, Q, V;
     const char *phase;
     int breath;
-  } const data[] = {{0, 0, 0, 0, "settle", 0},          {1, 5, 100, 100, "settle", 0},       {1.5, 15, 500, 350, "inspiration", 1},
-                    {2, 20, 500, 600, "inspiration", 1}, {2.25, 17, 0, 600, "pause", 1},      {2.5, 16, 0, 600, "pause", 1},
-                    {3.5, 5, -400, 200, "expiration", 1}, {4.5, 5, -70, 130, "expiration", 1}};
+  } const data[] = {{0, 0, 0, 0, "settle", 0},
+                    {1, 5, 100, 100, "settle", 0},
+                    {1.5, 15, 500, 350, "inspiration", 1},
+                    {2, 20, 500, 600, "inspiration", 1},
+                    {2.25, 17, 0, 600, "pause", 1},
+                    {2.5, 16, 0, 600, "pause", 1},
+                    {3.5, 5, -400, 200, "expiration", 1},
+                    {4.5, 5, -70, 130, "expiration", 1}};
   std::vector<SignalRow> rows;
   for (const auto &d : data) {
     SignalRow r;

@@ -8,17 +8,19 @@
 #include <numeric>
 #include <set>
 
-namespace pulmo::test {
-namespace {
+namespace pulmo::test
+{
+namespace
+{
 
 /// What the effects of a scene bring, effect by effect.
 struct Expected {
   // volume callbacks: residuals f0, f1 of each test field, Jacobians g0 ... g3 of each pair
   int f[2][2] = {{0, 0}, {0, 0}}, g[2][2][4] = {};
-  std::map<std::string, int> bd_f0;                          // by surface, momentum row
-  std::map<std::string, std::array<int, 2>> bd_g0_g1;        // displacement, displacement
-  std::map<std::string, int> bd_g0_pressure;                 // displacement, pressure
-  std::set<std::string> owners{"step", "tissue"};            // blocks of parameters
+  std::map<std::string, int> bd_f0;                   // by surface, momentum row
+  std::map<std::string, std::array<int, 2>> bd_g0_g1; // displacement, displacement
+  std::map<std::string, int> bd_g0_pressure;          // displacement, pressure
+  std::set<std::string> owners{"step", "tissue"};     // blocks of parameters
 
   explicit Expected(const SceneSpec &s)
   {
@@ -149,7 +151,8 @@ void expect_callbacks(SceneRun &run, const SceneSpec &scene)
     total += tangent[0] + tangent[1];
     if (scene.airflow) {
       const int by_pressure = expected.bd_g0_pressure.count(name) ? expected.bd_g0_pressure.at(name) : 0;
-      PULMO_OK(PetscWeakFormGetBdJacobian(wf, label, values[0], 0, 1, 0, &m[0], &g0, &m[1], &g1, &m[2], &g2, &m[3], &g3));
+      PULMO_OK(
+          PetscWeakFormGetBdJacobian(wf, label, values[0], 0, 1, 0, &m[0], &g0, &m[1], &g1, &m[2], &g2, &m[3], &g3));
       EXPECT_EQ(m[0], by_pressure);
       EXPECT_EQ(m[1] + m[2] + m[3], 0);
       total += by_pressure;
@@ -274,7 +277,8 @@ void expect_rows_and_entries(SceneRun &run, const SceneSpec &scene)
     const auto &near = neighbours[points[row]];
     for (PetscInt q : near) expected += free[q];
     EXPECT_EQ(n, expected) << "row " << row;
-    for (PetscInt k = 0; k < n; ++k) EXPECT_TRUE(near.count(points[columns[k]])) << "entry " << row << ", " << columns[k];
+    for (PetscInt k = 0; k < n; ++k)
+      EXPECT_TRUE(near.count(points[columns[k]])) << "entry " << row << ", " << columns[k];
     PULMO_OK(MatRestoreRow(A, row, &n, &columns, nullptr));
     entries += expected;
   }
@@ -391,13 +395,13 @@ TEST(Measure, VolumeOfAffineDeformationsIsExact)
     const double exact = det(identity + G) - 1;
     Measures m;
     PULMO_OK(interpolate(
-      run, x,
-      [&](const double X[3]) {
-        std::array<double, 3> u;
-        for (int i = 0; i < 3; ++i) u[i] = G[3 * i] * X[0] + G[3 * i + 1] * X[1] + G[3 * i + 2] * X[2];
-        return u;
-      },
-      [](const double *) { return 0; }));
+        run, x,
+        [&](const double X[3]) {
+          std::array<double, 3> u;
+          for (int i = 0; i < 3; ++i) u[i] = G[3 * i] * X[0] + G[3 * i + 1] * X[1] + G[3 * i + 2] * X[2];
+          return u;
+        },
+        [](const double *) { return 0; }));
     PULMO_OK(run.model().measure(x, m));
     EXPECT_NEAR(m.volume_change, exact, 1e-13);
     EXPECT_NEAR(m.min_J, 1 + exact, 1e-12);
@@ -415,8 +419,11 @@ TEST(Measure, TinyVolumesKeepTheirDigits)
   PULMO_OK(plain_scene(run, x.out()));
   const double e = 1e-12; // det F - 1 in doubles would be wrong in the fourth digit
   PULMO_OK(interpolate(
-    run, x, [&](const double X[3]) { return std::array<double, 3>{e * X[0], 2 * e * X[1], -0.5 * e * X[2]}; },
-    [](const double *) { return 0; }));
+      run, x,
+      [&](const double X[3]) {
+        return std::array<double, 3>{e * X[0], 2 * e * X[1], -0.5 * e * X[2]};
+      },
+      [](const double *) { return 0; }));
   PULMO_OK(run.model().measure(x, m));
   EXPECT_NEAR(m.volume_change, 2.5 * e, 1e-10 * e);
 }
@@ -431,8 +438,11 @@ TEST(Measure, CubicVolumeIsExactWithTheDefaultRule)
   PULMO_OK(plain_scene(run, x.out()));
   const double a = 0.3, b = -0.2, c = 0.4;
   PULMO_OK(interpolate(
-    run, x, [&](const double X[3]) { return std::array<double, 3>{a * X[0] * X[0], b * X[1] * X[1], c * X[2] * X[2]}; },
-    [](const double *) { return 0; }));
+      run, x,
+      [&](const double X[3]) {
+        return std::array<double, 3>{a * X[0] * X[0], b * X[1] * X[1], c * X[2] * X[2]};
+      },
+      [](const double *) { return 0; }));
   PULMO_OK(run.model().measure(x, m));
   EXPECT_NEAR(m.volume_change, (1 + a) * (1 + b) * (1 + c) - 1, 1e-13);
   // extremes at corners of the cube
@@ -449,8 +459,11 @@ TEST(Measure, SmallestJIsFoundWhereItIs)
   PULMO_OK(plain_scene(run, x.out()));
   // J = 1 - 1.2 Z^0.. : u_z = -0.6 Z^2 gives J = 1 - 1.2 Z, negative near Z = 1
   PULMO_OK(interpolate(
-    run, x, [](const double X[3]) { return std::array<double, 3>{0, 0, -0.6 * X[2] * X[2]}; },
-    [](const double *) { return 0; }));
+      run, x,
+      [](const double X[3]) {
+        return std::array<double, 3>{0, 0, -0.6 * X[2] * X[2]};
+      },
+      [](const double *) { return 0; }));
   PULMO_OK(run.model().measure(x, m));
   EXPECT_NEAR(m.min_J, -0.2, 1e-12);
   EXPECT_GT(m.min_J_points, m.min_J);

@@ -1,5 +1,5 @@
 // Kernels of the effects at one point: closed forms, and every Jacobian kernel against its residual kernel.
-#include "tensors.hpp"
+#include "unit/tensors.hpp"
 
 #include "pulmo/effects/airflow.hpp"
 #include "pulmo/effects/chest_wall.hpp"
@@ -7,8 +7,10 @@
 #include "pulmo/effects/traction.hpp"
 #include "pulmo/effects/ventilator.hpp"
 
-namespace pulmo::test {
-namespace {
+namespace pulmo::test
+{
+namespace
+{
 
 /// k(J) = k0 J^m + k1 J: a law whose derivative does not vanish.
 struct PowerPermeability {
@@ -73,12 +75,12 @@ void expect_derivative(const Data &data, Kernel<P> residual, Kernel<P> tangent, 
   for (int c = 0; c < components; ++c)
     for (int k = 0; k < variables; ++k) {
       const double expected = derivative(
-        [&](double step) {
-          Data moved = data;
-          change(moved, k, step);
-          return moved.call(residual, parameters, static_cast<std::size_t>(components))[c];
-        },
-        3e-4);
+          [&](double step) {
+            Data moved = data;
+            change(moved, k, step);
+            return moved.call(residual, parameters, static_cast<std::size_t>(components))[c];
+          },
+          3e-4);
       EXPECT_NEAR(A[place(c, k)], expected, 2e-10 * scale) << "component " << c << " by variable " << k;
     }
 }
@@ -89,18 +91,42 @@ void move_H(Data &d, int k, double step)
   d.H[k] += step;
   d.rate[k] += d.shift * step;
 }
-void move_p(Data &d, int, double step) { d.p += step; }
-void move_grad_p(Data &d, int k, double step) { d.grad_p[k] += step; }
-void move_u(Data &d, int k, double step) { d.u[k] += step; }
+void move_p(Data &d, int, double step)
+{
+  d.p += step;
+}
+void move_grad_p(Data &d, int k, double step)
+{
+  d.grad_p[k] += step;
+}
+void move_u(Data &d, int k, double step)
+{
+  d.u[k] += step;
+}
 
 /// g3 of (vector, vector): [i][k][J][L] for residual component 3 i + J and variable 3 k + L.
-int vector_by_vector(int c, int v) { return 27 * (c / 3) + 9 * (v / 3) + 3 * (c % 3) + v % 3; }
+int vector_by_vector(int c, int v)
+{
+  return 27 * (c / 3) + 9 * (v / 3) + 3 * (c % 3) + v % 3;
+}
 /// g3 of (scalar, vector): [k][I][L].
-int scalar_by_vector(int I, int v) { return 9 * (v / 3) + 3 * I + v % 3; }
+int scalar_by_vector(int I, int v)
+{
+  return 9 * (v / 3) + 3 * I + v % 3;
+}
 /// g1 of (vector, vector): [i][k][L], and everything else that is stored [component][variable].
-int nine(int c, int v) { return 9 * c + v; }
-int three(int c, int v) { return 3 * c + v; }
-int one(int c, int) { return c; }
+int nine(int c, int v)
+{
+  return 9 * c + v;
+}
+int three(int c, int v)
+{
+  return 3 * c + v;
+}
+int one(int c, int)
+{
+  return c;
+}
 
 template <class Check>
 void at_points(Check check)
@@ -120,8 +146,8 @@ TEST(Airflow, GasStressIsMinusPressureTimesCofactor)
   at_points([](const Data &d) {
     const auto f1 = d.call<NoParameters>(AirflowKernels::gas_stress, none, 9);
     for (int i = 0; i < 9; ++i) EXPECT_NEAR(f1[i], -d.p * d.cof()[i], 1e-13 * 10);
-    expect_derivative<NoParameters>(d, AirflowKernels::gas_stress, AirflowKernels::gas_stress_by_displacement, none, 9, 9,
-                                    move_H, vector_by_vector);
+    expect_derivative<NoParameters>(d, AirflowKernels::gas_stress, AirflowKernels::gas_stress_by_displacement, none, 9,
+                                    9, move_H, vector_by_vector);
     expect_derivative<NoParameters>(d, AirflowKernels::gas_stress, AirflowKernels::gas_stress_by_pressure, none, 9, 1,
                                     move_p, one);
   });
@@ -152,8 +178,8 @@ TEST(Airflow, PorosityRateDerivativeForAnyShift)
   at_points([](Data d) {
     for (double shift : {1 / d.step.dt, 7.0, 0.0, 55.0}) {
       d.shift = shift;
-      expect_derivative<NoParameters>(d, AirflowKernels::porosity_rate, AirflowKernels::porosity_rate_by_displacement, none,
-                                      1, 9, move_H, nine);
+      expect_derivative<NoParameters>(d, AirflowKernels::porosity_rate, AirflowKernels::porosity_rate_by_displacement,
+                                      none, 1, 9, move_H, nine);
     }
   });
 }
@@ -169,8 +195,7 @@ void expect_darcy(const Data &d, const typename Law::Parameters &k)
   const auto flux = d.call<P>(K::flux, k, 3);
   for (int I = 0; I < 3; ++I) {
     double expected = 0;
-    for (int L = 0; L < 3; ++L)
-      expected += Law::permeability(J, k).k * J * inverse_C[3 * I + L] * d.grad_p[L];
+    for (int L = 0; L < 3; ++L) expected += Law::permeability(J, k).k * J * inverse_C[3 * I + L] * d.grad_p[L];
     EXPECT_NEAR(flux[I], expected, 1e-12 * (1 + std::abs(expected)));
   }
   expect_derivative<P>(d, K::flux, K::flux_by_pressure, k, 3, 3, move_grad_p, three);
@@ -207,8 +232,8 @@ TEST(Ventilator, UniformGasStressTakesThePressureOfTheStep)
     d.airflow = false;
     const auto f1 = d.call<NoParameters>(UniformGasKernels::gas_stress, none, 9);
     for (int i = 0; i < 9; ++i) EXPECT_NEAR(f1[i], -0.4 * d.cof()[i], 1e-13 * 10);
-    expect_derivative<NoParameters>(d, UniformGasKernels::gas_stress, UniformGasKernels::gas_stress_by_displacement, none, 9,
-                                    9, move_H, vector_by_vector);
+    expect_derivative<NoParameters>(d, UniformGasKernels::gas_stress, UniformGasKernels::gas_stress_by_displacement,
+                                    none, 9, 9, move_H, vector_by_vector);
   });
 }
 
@@ -224,12 +249,12 @@ TEST(LumenPressure, WallTraction)
         for (int J = 0; J < 3; ++J) cof_N += d.cof()[3 * i + J] * d.normal[J];
         EXPECT_NEAR(f0[i], p * cof_N, 1e-13 * 20); // weak form: minus the traction -p cof F N
       }
-      expect_derivative<NoParameters>(d, LumenPressureKernels::wall, LumenPressureKernels::wall_by_displacement, none, 3, 9,
-                                      move_H, nine);
+      expect_derivative<NoParameters>(d, LumenPressureKernels::wall, LumenPressureKernels::wall_by_displacement, none,
+                                      3, 9, move_H, nine);
     }
     d.airflow = true;
-    expect_derivative<NoParameters>(d, LumenPressureKernels::wall, LumenPressureKernels::wall_by_pressure, none, 3, 1, move_p,
-                                    one);
+    expect_derivative<NoParameters>(d, LumenPressureKernels::wall, LumenPressureKernels::wall_by_pressure, none, 3, 1,
+                                    move_p, one);
   });
 }
 
@@ -293,7 +318,8 @@ TEST(Constants, EveryOwnerFindsItsOwnBlock)
   EXPECT_EQ(constants::get<B>(c).three, 3);
   EXPECT_EQ(constants::get<C>(c).absent, 0);
   // the names in use have tags of their own, exact in a double
-  const char *owners[] = {"step", "tissue", "permeability", "chest_wall", "traction", "ventilator", "airflow", "support"};
+  const char *owners[] = {"step",     "tissue",     "permeability", "chest_wall",
+                          "traction", "ventilator", "airflow",      "support"};
   for (const char *a : owners)
     for (const char *b : owners) EXPECT_EQ(constants::tag(a) == constants::tag(b), std::string(a) == b);
 }

@@ -3,14 +3,16 @@
 
 #include "pulmo/units.hpp"
 
-namespace pulmo::test {
-namespace {
+namespace pulmo::test
+{
+namespace
+{
 
 constexpr const char *names[] = {"berger", "ma", "birzle", "yoshihara", "rausch"};
 
 /// Three faces that slide in their planes hold the cube: u = (J^1/3 - 1) X.
 constexpr const char *rollers =
-  "-support -support_surfaces x0,y0,z0 -support_components_x0 x -support_components_y0 y -support_components_z0 z ";
+    "-support -support_surfaces x0,y0,z0 -support_components_x0 x -support_components_y0 y -support_components_z0 z ";
 
 /// Runs to 6 cmH2O and compares J at every point and, with @p rollers_hold, F at every point and u and p at every node
 /// with the closed form. Point pins let the cube turn as it grows: then C = J^2/3 I.
@@ -22,9 +24,9 @@ void expect_free_inflation(int law, const std::string &mesh, const std::string &
   bool finished = false;
 
   PULMO_OK(prepare(run, "-options_file " + source("petsc_options/solvers/tight.opts") + " -dm_plex_filename " +
-                          source(mesh) + " -mesh_scale 1 -tissue " + names[law - 1] +
-                          " -ventilator pcv -ventilator_pip 6 " + (rollers_hold ? rollers : "-support -support_rigid ") +
-                          options));
+                            source(mesh) + " -mesh_scale 1 -tissue " + names[law - 1] +
+                            " -ventilator pcv -ventilator_pip 6 " +
+                            (rollers_hold ? rollers : "-support -support_rigid ") + options));
   PULMO_OK(run.simulation().run(finished));
   ASSERT_TRUE(finished) << run.simulation().failure_text();
   EXPECT_EQ(run.simulation().rejected_steps(), 0);
@@ -44,8 +46,10 @@ void expect_free_inflation(int law, const std::string &mesh, const std::string &
     }
   }
   PULMO_OK(for_each_dof(run, [&](PetscInt dof, PetscInt field, PetscInt component, const PetscReal X[3]) {
-    if (field == displacement) worst_u = std::max(worst_u, std::abs(values[dof] - (stretch - 1) * X[component]));
-    else worst_p = std::max(worst_p, std::abs(values[dof] - p));
+    if (field == displacement)
+      worst_u = std::max(worst_u, std::abs(values[dof] - (stretch - 1) * X[component]));
+    else
+      worst_p = std::max(worst_p, std::abs(values[dof] - p));
   }));
   EXPECT_LT(worst_J, 1e-9);
   // CM5 has no shear stiffness at all in pure dilatation: stress grows with the cube of a shear strain, so that a
@@ -59,13 +63,13 @@ void expect_free_inflation(int law, const std::string &mesh, const std::string &
   EXPECT_LT(worst_p, 1e-9);
   EXPECT_NEAR(run.simulation().rows().back().pressure, 6, 1e-12);
   EXPECT_NEAR(run.simulation().rows().back().volume * 1000 / run.scene().mesh().volume(), J - 1, 1e-9);
-  std::printf("CM%d: J off by %.1e, C by %.1e, u by %.1e mm, p by %.1e kPa\n", law, worst_J, worst_C, worst_u, worst_p);
 }
 
 TEST(FreeInflation, WithoutAirflow)
 {
   for (int law = 1; law <= 5; ++law)
-    expect_free_inflation(law, "meshes/cube.msh", "-ventilator_inspiration 1 -ventilator_ramp 1 -ts_max_time 1 -ts_dt 0.05");
+    expect_free_inflation(law, "meshes/cube.msh",
+                          "-ventilator_inspiration 1 -ventilator_ramp 1 -ts_max_time 1 -ts_dt 0.1");
 }
 
 TEST(FreeInflation, OnPointPins)
@@ -82,7 +86,7 @@ TEST(FreeInflation, WithAirflowThroughTheWholeBoundary)
   for (int law = 1; law <= 5; ++law)
     expect_free_inflation(law, "meshes/cube.msh",
                           "-airflow -airflow_permeability 100 -airflow_surfaces x0,x1,y0,y1,z0,z1"
-                          " -ventilator_inspiration 1.5 -ventilator_ramp 1 -ts_max_time 1.5 -ts_dt 0.05");
+                          " -ventilator_inspiration 1.5 -ventilator_ramp 1 -ts_max_time 1.5 -ts_dt 0.1");
 }
 
 } // namespace

@@ -1,8 +1,10 @@
 // Kinematics of a point against long double arithmetic and numerical derivatives.
-#include "tensors.hpp"
+#include "unit/tensors.hpp"
 
-namespace pulmo::test {
-namespace {
+namespace pulmo::test
+{
+namespace
+{
 
 /// det(I + H) - 1 in long double.
 double exact_J_minus_1(const Tensor &H)
@@ -84,7 +86,8 @@ TEST(Kinematics, CofactorDerivativeAgreesWithDifferences)
         cofactor(down.data(), cof_down.data());
         for (int i = 0; i < 3; ++i)
           for (int J = 0; J < 3; ++J)
-            EXPECT_NEAR(g3[27 * i + 9 * k + 3 * J + L] - 0.25, factor * (cof_up[3 * i + J] - cof_down[3 * i + J]), 1e-14 * 20);
+            EXPECT_NEAR(g3[27 * i + 9 * k + 3 * J + L] - 0.25, factor * (cof_up[3 * i + J] - cof_down[3 * i + J]),
+                        1e-14 * 20);
       }
   }
 }

@@ -1,12 +1,17 @@
 // The five tissue laws through the interface TissueLaw, against differences, symmetries and closed forms.
-#include "tensors.hpp"
+#include "unit/tensors.hpp"
 
 #include "pulmo/units.hpp"
 
-namespace pulmo::test {
-namespace {
+namespace pulmo::test
+{
+namespace
+{
 
-double energy(const TissueLaw &law, const Tensor &F) { return law.energy(state_of_F(F)); }
+double energy(const TissueLaw &law, const Tensor &F)
+{
+  return law.energy(state_of_F(F));
+}
 
 Tensor stress(const TissueLaw &law, const Tensor &F)
 {
@@ -23,7 +28,10 @@ std::array<double, 81> tangent(const TissueLaw &law, const Tensor &F)
 }
 
 /// Stored [i][k][J][L].
-std::size_t entry(int i, int J, int k, int L) { return static_cast<std::size_t>(27 * i + 9 * k + 3 * J + L); }
+std::size_t entry(int i, int J, int k, int L)
+{
+  return static_cast<std::size_t>(27 * i + 9 * k + 3 * J + L);
+}
 
 double largest_entry(const std::array<double, 81> &A)
 {
@@ -67,12 +75,12 @@ TEST(Laws, StressIsTheDerivativeOfTheEnergy)
     const double scale = largest(P) + std::abs(energy(law, F));
     for (int c = 0; c < 9; ++c) {
       const double dW = derivative(
-        [&](double step) {
-          Tensor G = F;
-          G[c] += step;
-          return energy(law, G);
-        },
-        h);
+          [&](double step) {
+            Tensor G = F;
+            G[c] += step;
+            return energy(law, G);
+          },
+          h);
       EXPECT_NEAR(P[c], dW, 1e-9 * scale);
     }
   });
@@ -88,12 +96,12 @@ TEST(Laws, TangentIsTheDerivativeOfTheStress)
         for (int i = 0; i < 3; ++i)
           for (int J = 0; J < 3; ++J) {
             const double dP = derivative(
-              [&](double step) {
-                Tensor G = F;
-                G[3 * k + L] += step;
-                return stress(law, G)[3 * i + J];
-              },
-              h);
+                [&](double step) {
+                  Tensor G = F;
+                  G[3 * k + L] += step;
+                  return stress(law, G)[3 * i + J];
+                },
+                h);
             EXPECT_NEAR(A[entry(i, J, k, L)], dP, 1e-9 * scale);
           }
   });
@@ -106,8 +114,7 @@ TEST(Laws, TangentHasMajorSymmetry)
     for (int i = 0; i < 3; ++i)
       for (int J = 0; J < 3; ++J)
         for (int k = 0; k < 3; ++k)
-          for (int L = 0; L < 3; ++L)
-            EXPECT_NEAR(A[entry(i, J, k, L)], A[entry(k, L, i, J)], 1e-13 * largest_entry(A));
+          for (int L = 0; L < 3; ++L) EXPECT_NEAR(A[entry(i, J, k, L)], A[entry(k, L, i, J)], 1e-13 * largest_entry(A));
   });
 }
 
@@ -215,9 +222,9 @@ TEST(Laws, InflatedVolumesAtSixCentimetresOfWater)
   for (int law = 1; law <= 5; ++law) {
     EXPECT_NEAR(inflation_J(law, p), J[law - 1], 5.1e-5) << "CM" << law;
     // and from the law's own stress
-    const double own = root(
-      [&](double x) { return stress(*laws[law - 1], std::cbrt(x) * identity)[0] / std::pow(x, 2. / 3) - p; }, 0.9,
-      law == 4 ? 2.5 : 6);
+    const double own =
+        root([&](double x) { return stress(*laws[law - 1], std::cbrt(x) * identity)[0] / std::pow(x, 2. / 3) - p; },
+             0.9, law == 4 ? 2.5 : 6);
     EXPECT_NEAR(own, inflation_J(law, p), 1e-12) << "CM" << law;
   }
 }
@@ -227,8 +234,7 @@ TEST(Laws, YoshiharaHasItsLimitPoint)
   const auto laws = five_laws();
   const TissueLaw &law = *laws[3];
   const auto p = [&](double J) { return stress(law, std::cbrt(J) * identity)[0] / std::pow(J, 2. / 3); };
-  const double limit = root(
-    [&](double J) { return -derivative([&](double d) { return p(J + d); }, 1e-3); }, 1.5, 4);
+  const double limit = root([&](double J) { return -derivative([&](double d) { return p(J + d); }, 1e-3); }, 1.5, 4);
   EXPECT_NEAR(limit, 2.534, 5e-4);
   EXPECT_NEAR(p(limit) / units::kPa_per_cmH2O, 16.83, 5e-3);
 }

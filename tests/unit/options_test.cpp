@@ -4,8 +4,10 @@
 #include "pulmo/effects/chest_wall.hpp"
 #include "pulmo/tissue/berger.hpp"
 
-namespace pulmo::test {
-namespace {
+namespace pulmo::test
+{
+namespace
+{
 
 using strings = std::vector<std::string>;
 
@@ -68,7 +70,8 @@ TEST(Options, Numbers)
 TEST(Options, WholeNumbers)
 {
   const auto read = [](const std::string &database, PetscInt &value) {
-    return declare(database, [&](Options &o) { return o.whole("count", "-", Range::between(1, 10), "a count", value); });
+    return declare(database,
+                   [&](Options &o) { return o.whole("count", "-", Range::between(1, 10), "a count", value); });
   };
   PetscInt n = 7;
   EXPECT_EQ(read("", n), "");
@@ -181,14 +184,15 @@ std::string scene_error(const std::string &options)
   const Registry registry = Registry::standard();
   SceneRun run(registry);
   return error_of([&] {
-    return prepare(run, "-dm_plex_filename " + source("meshes/cube_coarse.msh") + " -mesh_scale 1 -pc_type lu " + options);
+    return prepare(run,
+                   "-dm_plex_filename " + source("meshes/cube_coarse.msh") + " -mesh_scale 1 -pc_type lu " + options);
   });
 }
 
 TEST(SceneOptions, AliasesChooseTheSameLaws)
 {
   const std::pair<const char *, const char *> laws[] = {
-    {"cm1", "berger"}, {"cm2", "ma"}, {"cm3", "birzle"}, {"cm4", "yoshihara"}, {"cm5", "rausch"}};
+      {"cm1", "berger"}, {"cm2", "ma"}, {"cm3", "birzle"}, {"cm4", "yoshihara"}, {"cm5", "rausch"}};
   for (const auto &[alias, name] : laws)
     for (const char *given : {alias, name}) {
       const Registry registry = Registry::standard();
@@ -244,7 +248,8 @@ TEST(SceneOptions, MistakesNameTheMend)
 {
   EXPECT_HAS(scene_error("-chest_wall -chest_wall_surfaces x9"), "it has x0, x1, y0, y1, z0, z1");
   EXPECT_HAS(scene_error("-chest_wall -chest_wall_surfaces x0 -chest_wall_stiffness -1"), ">= 0");
-  EXPECT_HAS(scene_error("-chest_wall -chest_wall_surfaces x0 -chest_wall_stiffnes 1"), "did you mean -chest_wall_stiffness?");
+  EXPECT_HAS(scene_error("-chest_wall -chest_wall_surfaces x0 -chest_wall_stiffnes 1"),
+             "did you mean -chest_wall_stiffness?");
   EXPECT_HAS(scene_error("-chest_wall -chest_wall_surfaces x0 -chest_wall_direction sideways"), "full, normal");
   EXPECT_HAS(scene_error("-lumen_pressure -lumen_pressure_surfaces x0"), "needs a gas pressure");
   EXPECT_HAS(scene_error("-support"), "-support_surfaces");
@@ -265,9 +270,10 @@ TEST(SceneOptions, SurfacesHaveStiffnessesOfTheirOwn)
 {
   const Registry registry = Registry::standard();
   SceneRun run(registry);
-  PULMO_OK(prepare(run, "-dm_plex_filename " + source("meshes/cube_coarse.msh") +
-                          " -mesh_scale 1 -pc_type lu -chest_wall -chest_wall_surfaces y0,z1,x1 -chest_wall_stiffness 0.5"
-                          " -chest_wall_stiffness_z1 0.25"));
+  PULMO_OK(
+      prepare(run, "-dm_plex_filename " + source("meshes/cube_coarse.msh") +
+                       " -mesh_scale 1 -pc_type lu -chest_wall -chest_wall_surfaces y0,z1,x1 -chest_wall_stiffness 0.5"
+                       " -chest_wall_stiffness_z1 0.25"));
   for (const ParameterBlock &block : run.model().composition().parameter_blocks()) {
     if (block.owner != std::string("chest_wall")) continue;
     EXPECT_EQ(block.data[0], 0.5);

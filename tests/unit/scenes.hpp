@@ -5,7 +5,8 @@
 #include "support/scene.hpp"
 #include "unit/tensors.hpp"
 
-namespace pulmo::test {
+namespace pulmo::test
+{
 
 /// Inside a test `Run` means testing::Test::Run.
 using SceneRun = pulmo::Run;
@@ -20,7 +21,8 @@ struct SceneSpec {
 
   std::string options() const
   {
-    std::string s = "-dm_plex_filename " + source("meshes/cube_coarse.msh") + " -mesh_scale 1 -pc_type lu -tissue " + law;
+    std::string s =
+        "-dm_plex_filename " + source("meshes/cube_coarse.msh") + " -mesh_scale 1 -pc_type lu -tissue " + law;
     if (airflow) s += " -airflow -airflow_permeability 0.7 -airflow_surfaces x1";
     if (ventilator) s += " -ventilator pcv -ventilator_pip 6";
     if (!chest_wall.empty())
@@ -28,7 +30,8 @@ struct SceneSpec {
            " -chest_wall_direction " +
            chest_wall;
     if (lumen_pressure) s += " -lumen_pressure -lumen_pressure_surfaces x1,z1";
-    if (traction) s += " -traction -traction_surfaces y0,x0 -traction_value 0.1,-0.2,0.05 -traction_value_y0 0.03,0.3,0.02";
+    if (traction)
+      s += " -traction -traction_surfaces y0,x0 -traction_value 0.1,-0.2,0.05 -traction_value_y0 0.03,0.3,0.02";
     if (support == "surfaces")
       s += " -support -support_surfaces y1,z0 -support_components_z0 xz -support_displacement_y1 0.01,0.02,-0.01";
     if (support == "rigid") s += " -support -support_rigid";
@@ -140,14 +143,15 @@ inline PetscErrorCode random_state(Run &run, unsigned seed, State &s)
       const Tensor G = random.tensor(0.06);
       const double inflation = random(0.02, 0.1);
       PetscCall(interpolate(
-        run, v,
-        [&](const double X[3]) {
-          std::array<double, 3> u;
-          for (int i = 0; i < 3; ++i)
-            u[i] = inflation * X[i] + G[3 * i] * X[0] + G[3 * i + 1] * X[1] + G[3 * i + 2] * X[2] + random(-noise, noise);
-          return u;
-        },
-        [&](const double X[3]) { return 0.4 + 0.2 * X[0] - 0.3 * X[2] + random(-0.1, 0.1); }));
+          run, v,
+          [&](const double X[3]) {
+            std::array<double, 3> u;
+            for (int i = 0; i < 3; ++i)
+              u[i] = inflation * X[i] + G[3 * i] * X[0] + G[3 * i + 1] * X[1] + G[3 * i + 2] * X[2] +
+                     random(-noise, noise);
+            return u;
+          },
+          [&](const double X[3]) { return 0.4 + 0.2 * X[0] - 0.3 * X[2] + random(-0.1, 0.1); }));
       PetscCall(model.constrain(v == before ? s.t - s.dt : s.t, v));
       PetscCall(model.measure(v, measures));
       noise *= 0.8;

@@ -14,13 +14,15 @@
 #include <string>
 #include <vector>
 
-namespace pulmo::test {
+namespace pulmo::test
+{
 
 using Tensor = std::array<double, 9>;
 constexpr Tensor identity{1, 0, 0, 0, 1, 0, 0, 0, 1};
 
 /// Uniform random numbers, the same in every run.
-class Random {
+class Random
+{
 public:
   explicit Random(unsigned seed) : engine_(seed) {}
   double operator()(double low = -1, double high = 1)
@@ -48,7 +50,10 @@ inline Tensor operator+(Tensor A, const Tensor &B)
   for (int i = 0; i < 9; ++i) A[i] += B[i];
   return A;
 }
-inline Tensor operator-(const Tensor &A, const Tensor &B) { return A + -1.0 * B; }
+inline Tensor operator-(const Tensor &A, const Tensor &B)
+{
+  return A + -1.0 * B;
+}
 inline Tensor operator*(const Tensor &A, const Tensor &B)
 {
   Tensor C{};
@@ -57,7 +62,10 @@ inline Tensor operator*(const Tensor &A, const Tensor &B)
       for (int k = 0; k < 3; ++k) C[3 * i + j] += A[3 * i + k] * B[3 * k + j];
   return C;
 }
-inline Tensor transposed(const Tensor &A) { return {A[0], A[3], A[6], A[1], A[4], A[7], A[2], A[5], A[8]}; }
+inline Tensor transposed(const Tensor &A)
+{
+  return {A[0], A[3], A[6], A[1], A[4], A[7], A[2], A[5], A[8]};
+}
 inline double dot(const Tensor &A, const Tensor &B)
 {
   double s = 0;
@@ -77,7 +85,10 @@ T det(const T A[9])
   return A[0] * A[4] * A[8] + A[1] * A[5] * A[6] + A[2] * A[3] * A[7] - A[2] * A[4] * A[6] - A[1] * A[3] * A[8] -
          A[0] * A[5] * A[7];
 }
-inline double det(const Tensor &A) { return det(A.data()); }
+inline double det(const Tensor &A)
+{
+  return det(A.data());
+}
 /// A^-1 by Gauss-Jordan elimination with pivoting.
 inline Tensor inverse(Tensor A)
 {
@@ -144,7 +155,8 @@ inline double derivative(const std::function<double(double)> &f, double h)
 inline std::vector<std::unique_ptr<TissueLaw>> five_laws()
 {
   auto laws = Registry::standard().make_tissue_laws();
-  std::sort(laws.begin(), laws.end(), [](const auto &a, const auto &b) { return std::string(a->alias()) < b->alias(); });
+  std::sort(laws.begin(), laws.end(),
+            [](const auto &a, const auto &b) { return std::string(a->alias()) < b->alias(); });
   return laws;
 }
 
@@ -169,7 +181,8 @@ inline double inflation_pressure(int law, double J)
     const double c = 1.298, beta = 0.75;
     return 2 * c * t - 2 * c * std::pow(J, -2 * beta - 1);
   }
-  default: return 16.5 / 2 * (J - 1 / J);
+  default:
+    return 16.5 / 2 * (J - 1 / J);
   }
 }
 

@@ -4,13 +4,16 @@
 
 #include "pulmo/effects/airflow.hpp"
 
-namespace pulmo::test {
-namespace {
+namespace pulmo::test
+{
+namespace
+{
 
 // ------------------------------------------------------------------------------ virtual work of affine states
 
 /// Gauss points on [0, 1].
-constexpr double gauss[3] = {0.5 - 0.3872983346207417, 0.5, 0.5 + 0.3872983346207417}, weight[3] = {5. / 18, 8. / 18, 5. / 18};
+constexpr double gauss[3] = {0.5 - 0.3872983346207417, 0.5, 0.5 + 0.3872983346207417},
+                 weight[3] = {5. / 18, 8. / 18, 5. / 18};
 
 /// Integral over a face of the unit cube (x0 ... z1) of a polynomial of degree 5 in each coordinate.
 double over_face(const std::string &face, const std::function<double(const double[3], const double[3])> &f)
@@ -35,7 +38,10 @@ std::array<double, 3> affine(const Tensor &A, const std::array<double, 3> &a, co
           a[2] + A[6] * X[0] + A[7] * X[1] + A[8] * X[2]};
 }
 
-double dot3(const double *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+double dot3(const double *a, const double *b)
+{
+  return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
 
 /// u, p, test displacement and test pressure affine in X: the residual's virtual work in closed form. CM4.
 void expect_virtual_work(const SceneSpec &scene, unsigned seed)
@@ -57,9 +63,12 @@ void expect_virtual_work(const SceneSpec &scene, unsigned seed)
   for (VecHandle *v : {&x_t, &before, &eta, &F}) PULMO_OK(VecDuplicate(x, v->out()));
   const auto pressure_of = [&](const double X[3]) { return p0 + dot3(g.data(), X); };
   const auto q_of = [&](const double X[3]) { return q0 + dot3(e.data(), X); };
-  PULMO_OK(interpolate(run, x, [&](const double X[3]) { return affine(G, a, X); }, pressure_of));
-  PULMO_OK(interpolate(run, before, [&](const double X[3]) { return affine(G0, b, X); }, pressure_of));
-  PULMO_OK(interpolate(run, eta, [&](const double X[3]) { return affine(B, b, X); }, q_of));
+  PULMO_OK(interpolate(
+      run, x, [&](const double X[3]) { return affine(G, a, X); }, pressure_of));
+  PULMO_OK(interpolate(
+      run, before, [&](const double X[3]) { return affine(G0, b, X); }, pressure_of));
+  PULMO_OK(interpolate(
+      run, eta, [&](const double X[3]) { return affine(B, b, X); }, q_of));
   PULMO_OK(VecWAXPY(x_t, -1, before, x));
   PULMO_OK(VecScale(x_t, 1 / dt));
   PULMO_OK(model.set_step(dt, gas));
@@ -83,16 +92,19 @@ void expect_virtual_work(const SceneSpec &scene, unsigned seed)
   const double J = det(Fd), J0 = det(identity + G0), centre[3] = {0.5, 0.5, 0.5};
   const Tensor cof = J * transposed(F_inverse), P = 2 * c * (Fd - std::pow(J, -2 * beta - 1) * cof);
   double expected = dot(P, B);
-  if (scene.airflow) expected -= pressure_of(centre) * dot(cof, B);
-  else if (scene.ventilator) expected -= gas * dot(cof, B);
+  if (scene.airflow)
+    expected -= pressure_of(centre) * dot(cof, B);
+  else if (scene.ventilator)
+    expected -= gas * dot(cof, B);
   const auto u = [&](const double X[3]) { return affine(G, a, X); };
   const auto test = [&](const double X[3]) { return affine(B, b, X); };
   if (!scene.chest_wall.empty())
     for (const auto &[face, stiffness] : {std::pair<std::string, double>("x0", 0.08), {"z1", 0.21}})
-      expected += stiffness * over_face(face, [&](const double X[3], const double N[3]) {
-                    const auto v = u(X), w = test(X);
-                    return scene.chest_wall == "full" ? dot3(v.data(), w.data()) : dot3(v.data(), N) * dot3(w.data(), N);
-                  });
+      expected +=
+          stiffness * over_face(face, [&](const double X[3], const double N[3]) {
+            const auto v = u(X), w = test(X);
+            return scene.chest_wall == "full" ? dot3(v.data(), w.data()) : dot3(v.data(), N) * dot3(w.data(), N);
+          });
   if (scene.lumen_pressure)
     for (const char *face : {"x1", "z1"})
       expected += over_face(face, [&](const double X[3], const double N[3]) {
@@ -100,8 +112,8 @@ void expect_virtual_work(const SceneSpec &scene, unsigned seed)
         return (scene.airflow ? pressure_of(X) : gas) * dot3(cof_N.data(), w.data());
       });
   if (scene.traction)
-    for (const auto &[face, T] : {std::pair<std::string, std::array<double, 3>>("y0", {0.03, 0.3, 0.02}),
-                                  {"x0", {0.1, -0.2, 0.05}}}) {
+    for (const auto &[face, T] :
+         {std::pair<std::string, std::array<double, 3>>("y0", {0.03, 0.3, 0.02}), {"x0", {0.1, -0.2, 0.05}}}) {
       const std::array<double, 3> load = T;
       expected -= over_face(face, [&](const double X[3], const double *) { return dot3(load.data(), test(X).data()); });
     }
@@ -156,7 +168,8 @@ TEST(WeakForm, LumenPressureOfAQuadraticDeformation)
       PULMO_OK(run.model().residual(0, x, x_t, F));
       const ReadArray f(F);
       PULMO_OK(for_each_dof(run, [&](PetscInt dof, PetscInt field, PetscInt component, const PetscReal X[3]) {
-        if (field == displacement) work[lumen] += f[dof] * affine(B, b, X)[component] / run.model().row_scale(displacement);
+        if (field == displacement)
+          work[lumen] += f[dof] * affine(B, b, X)[component] / run.model().row_scale(displacement);
       }));
     }
     double expected = 0;
@@ -186,9 +199,11 @@ TEST(WeakForm, FlowAndReactionOfAnAffineState)
   const double dt = 0.05;
   PULMO_OK(DMCreateLocalVector(run.model().dm(), x.out()));
   for (VecHandle *v : {&x_t, &F}) PULMO_OK(VecDuplicate(x, v->out()));
-  PULMO_OK(interpolate(run, x, [&](const double X[3]) { return affine(G, {}, X); }, [](const double *) { return 0.3; }));
   PULMO_OK(interpolate(
-    run, x_t, [&](const double X[3]) { return affine((1 / dt) * (G - G0), {}, X); }, [](const double *) { return 0; }));
+      run, x, [&](const double X[3]) { return affine(G, {}, X); }, [](const double *) { return 0.3; }));
+  PULMO_OK(interpolate(
+      run, x_t, [&](const double X[3]) { return affine((1 / dt) * (G - G0), {}, X); },
+      [](const double *) { return 0; }));
   PULMO_OK(run.model().set_step(dt, 0));
   PULMO_OK(run.model().residual(0, x, x_t, F));
   double flow, force[3];
@@ -294,7 +309,10 @@ struct CubicPermeability {
     PetscScalar k = 0.5;
   };
   static PetscErrorCode declare(Options &, Parameters &) { return PETSC_SUCCESS; }
-  static PermeabilityValue permeability(PetscScalar J, const Parameters &p) { return {p.k * J * J * J, 3 * p.k * J * J}; }
+  static PermeabilityValue permeability(PetscScalar J, const Parameters &p)
+  {
+    return {p.k * J * J * J, 3 * p.k * J * J};
+  }
 };
 
 TEST(WeakForm, JacobianWithAPermeabilityLawOfTheTest)
