@@ -5,10 +5,8 @@
 #include "pulmo/effects/ventilator.hpp"
 #include "pulmo/units.hpp"
 
-namespace pulmo::test
-{
-namespace
-{
+namespace pulmo::test {
+namespace {
 
 // ---------------------------------------------------------------------------------------------------- programme
 

@@ -8,10 +8,8 @@
 #include <numeric>
 #include <set>
 
-namespace pulmo::test
-{
-namespace
-{
+namespace pulmo::test {
+namespace {
 
 /// What the effects of a scene bring, effect by effect.
 struct Expected {

@@ -7,10 +7,8 @@
 #include "pulmo/effects/traction.hpp"
 #include "pulmo/effects/ventilator.hpp"
 
-namespace pulmo::test
-{
-namespace
-{
+namespace pulmo::test {
+namespace {
 
 /// k(J) = k0 J^m + k1 J: a law whose derivative does not vanish.
 struct PowerPermeability {

@@ -3,10 +3,8 @@
 
 #include "pulmo/units.hpp"
 
-namespace pulmo::test
-{
-namespace
-{
+namespace pulmo::test {
+namespace {
 
 constexpr const char *names[] = {"berger", "ma", "birzle", "yoshihara", "rausch"};
 

@@ -1,10 +1,8 @@
 // Kinematics of a point against long double arithmetic and numerical derivatives.
 #include "unit/tensors.hpp"
 
-namespace pulmo::test
-{
-namespace
-{
+namespace pulmo::test {
+namespace {
 
 /// det(I + H) - 1 in long double.
 double exact_J_minus_1(const Tensor &H)

@@ -3,10 +3,8 @@
 
 #include "pulmo/units.hpp"
 
-namespace pulmo::test
-{
-namespace
-{
+namespace pulmo::test {
+namespace {
 
 double energy(const TissueLaw &law, const Tensor &F)
 {

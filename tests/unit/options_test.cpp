@@ -4,10 +4,8 @@
 #include "pulmo/effects/chest_wall.hpp"
 #include "pulmo/tissue/berger.hpp"
 
-namespace pulmo::test
-{
-namespace
-{
+namespace pulmo::test {
+namespace {
 
 using strings = std::vector<std::string>;
 
@@ -229,9 +227,9 @@ TEST(SceneOptions, ParametersOfAnotherLawAreErrors)
 TEST(SceneOptions, OptionsOfInactiveEffectsAreErrors)
 {
   const std::pair<const char *, const char *> cases[] = {{"-chest_wall_stiffness 0.1", "-chest_wall"},
-                                                         {"-chest_wall off -chest_wall_direction full", "-chest_wall"},
+
                                                          {"-airflow_permeability 10", "-airflow"},
-                                                         {"-airflow off -airflow_surfaces x1", "-airflow"},
+
                                                          {"-ventilator_pip 6", "-ventilator"},
                                                          {"-lumen_pressure_surfaces x1", "-lumen_pressure"},
                                                          {"-support_rigid", "-support"},
@@ -242,6 +240,17 @@ TEST(SceneOptions, OptionsOfInactiveEffectsAreErrors)
     EXPECT_HAS(text, std::string("needs ") + mend);
   }
   EXPECT_EQ(scene_error("-chest_wall off -airflow off -ventilator off"), "");
+}
+
+TEST(SceneOptions, SettingsOfAnEffectThatIsTurnedOffAreKept)
+{
+  EXPECT_EQ(scene_error("-chest_wall off -chest_wall_direction full"), "");
+  EXPECT_EQ(scene_error("-airflow -airflow_surfaces x1 -airflow_permeability 3 -airflow off"), "");
+  EXPECT_EQ(scene_error("-chest_wall -chest_wall_surfaces x0,z1 -chest_wall_stiffness_z1 0.2 -chest_wall off"), "");
+  EXPECT_EQ(scene_error("-ventilator pcv -ventilator_pip 9 -ventilator off"), "");
+  EXPECT_HAS(scene_error("-chest_wall_direction full -chest_wall off -chest_wall on -chest_wall_surfaces q"),
+             "has no surface");
+  EXPECT_HAS(scene_error("-chest_wall off -chest_wall_stiffnes 1"), "unknown option -chest_wall_stiffnes");
 }
 
 TEST(SceneOptions, MistakesNameTheMend)

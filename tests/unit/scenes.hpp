@@ -5,8 +5,7 @@
 #include "support/scene.hpp"
 #include "unit/tensors.hpp"
 
-namespace pulmo::test
-{
+namespace pulmo::test {
 
 /// Inside a test `Run` means testing::Test::Run.
 using SceneRun = pulmo::Run;

@@ -14,15 +14,13 @@
 #include <string>
 #include <vector>
 
-namespace pulmo::test
-{
+namespace pulmo::test {
 
 using Tensor = std::array<double, 9>;
 constexpr Tensor identity{1, 0, 0, 0, 1, 0, 0, 0, 1};
 
 /// Uniform random numbers, the same in every run.
-class Random
-{
+class Random {
 public:
   explicit Random(unsigned seed) : engine_(seed) {}
   double operator()(double low = -1, double high = 1)

@@ -4,10 +4,8 @@
 
 #include "pulmo/effects/airflow.hpp"
 
-namespace pulmo::test
-{
-namespace
-{
+namespace pulmo::test {
+namespace {
 
 // ------------------------------------------------------------------------------ virtual work of affine states
 
@@ -434,14 +432,10 @@ void expect_same_integration(const SceneSpec &scene, unsigned seed, double toler
     }
 }
 
-// Without lumen pressure: PETSc 3.18 gives no valid Grad u on the faces of tetrahedra (DMField reads the face rule as a
-// rule of the cell), and lumen pressure is the one term that needs it. The closed forms above cover it.
-
 TEST(Integration, AgreesWithPetscForEveryCombinationOfEffects)
 {
   unsigned seed = 900;
   for (const SceneSpec &scene : all_scenes()) {
-    if (scene.lumen_pressure) continue;
     expect_same_integration(scene, ++seed, 1e-12);
     if (HasFatalFailure()) return;
   }
@@ -450,11 +444,7 @@ TEST(Integration, AgreesWithPetscForEveryCombinationOfEffects)
 TEST(Integration, AgreesWithPetscForEveryLaw)
 {
   for (const char *law : {"berger", "ma", "birzle", "yoshihara", "rausch"})
-    for (bool airflow : {false, true}) {
-      SceneSpec scene = full_scene(airflow, law);
-      scene.lumen_pressure = false;
-      expect_same_integration(scene, 40, 1e-12);
-    }
+    for (bool airflow : {false, true}) expect_same_integration(full_scene(airflow, law), 40, 1e-12);
 }
 
 TEST(Integration, AgreesWithPetscForOtherDegreesOfQuadrature)
@@ -462,7 +452,6 @@ TEST(Integration, AgreesWithPetscForOtherDegreesOfQuadrature)
   for (const char *degree : {"2", "4", "6"})
     for (bool airflow : {false, true}) {
       SceneSpec scene = full_scene(airflow);
-      scene.lumen_pressure = false;
       scene.more = std::string("-quadrature_degree ") + degree;
       expect_same_integration(scene, 50, 1e-12);
     }
