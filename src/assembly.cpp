@@ -570,7 +570,7 @@ PetscErrorCode Assembly::measure(Vec x, Measures &measures) const
       extremes[0] = std::max(extremes[0], J);
       if (q < n_rule) {
         sum += sample_weights_[q] * Jm1;
-        extremes[1] = std::max(extremes[1], -J);
+        extremes[1] = std::max(extremes[1], std::isnan(J) ? PETSC_MAX_REAL : -J);
       }
       if (!(J >= least.value)) { // also taken when J is not a number
         least.value = std::isnan(J) ? -PETSC_MAX_REAL : J;

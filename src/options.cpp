@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdlib>
+#include <optional>
 #include <sstream>
 
 namespace pulmo {
@@ -51,12 +52,23 @@ std::size_t distance(const std::string &a, const std::string &b)
   return row[b.size()];
 }
 
+/// What the value of a flag says, in any case; empty if it says neither.
+std::optional<bool> truth(std::string value)
+{
+  std::transform(value.begin(), value.end(), value.begin(), [](unsigned char c) { return std::tolower(c); });
+  for (const char *yes : {"", "on", "true", "yes", "1"})
+    if (value == yes) return true;
+  for (const char *no : {"off", "false", "no", "0"})
+    if (value == no) return false;
+  return {};
+}
+
 /// Whether the last `-name` of the list says off.
 bool turned_off(const std::vector<std::pair<std::string, std::string>> &list, const std::string &name)
 {
   bool off = false;
   for (const auto &[option, value] : list)
-    if (option == "-" + name) off = value == "off" || value == "false" || value == "no" || value == "0";
+    if (option == "-" + name) off = truth(value) == false;
   return off;
 }
 
@@ -106,7 +118,7 @@ PetscErrorCode Options::find(const std::string &name, const std::string &default
   PetscCall(PetscOptionsGetString(nullptr, nullptr, option.c_str(), buffer, sizeof(buffer), &set));
   PetscCall(PetscOptionsHasName(nullptr, nullptr, option.c_str(), &has));
   is_given = has && group.in_use; // check_unknown() reports an option of an effect or law that is not in use
-  if (is_given) raw = buffer;
+  if (has) raw = buffer;
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -166,12 +178,9 @@ PetscErrorCode Options::flag(const std::string &name, const std::string &help, b
   PetscFunctionBeginUser;
   PetscCall(find(name, value ? "on" : "off", "on/off", "", help, raw, is_given));
   if (is_given) {
-    static const std::vector<std::string> yes{"", "on", "true", "yes", "1"}, no{"off", "false", "no", "0"};
-    std::transform(raw.begin(), raw.end(), raw.begin(), [](unsigned char c) { return std::tolower(c); });
-    const bool on = std::find(yes.begin(), yes.end(), raw) != yes.end();
-    PulmoUserCheck(on || std::find(no.begin(), no.end(), raw) != no.end(), comm_, "option %s is on or off, not '%s'",
-                   full(name).c_str(), raw.c_str());
-    value = on;
+    const std::optional<bool> on = truth(raw);
+    PulmoUserCheck(on, comm_, "option %s is on or off, not '%s'", full(name).c_str(), raw.c_str());
+    value = *on;
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -214,7 +223,8 @@ PetscErrorCode Options::names(const std::string &name, const std::string &help, 
 
   PetscFunctionBeginUser;
   PetscCall(find(name, join(value, ","), "names, separated by commas", "", help, raw, is_given));
-  if (is_given) {
+  // also of an effect that is not in use: its options for each of these names are then known, too
+  if (!raw.empty() || is_given) {
     value = split(raw, ',');
     PulmoUserCheck(!value.empty(), comm_, "option %s names nothing", full(name).c_str());
     auto sorted = value;
