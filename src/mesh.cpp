@@ -96,8 +96,8 @@ PetscErrorCode Mesh::read(const Options &options, bool ventilated)
   PetscCall(DMSetFromOptions(dm_));
   PetscCall(DMViewFromOptions(dm_, nullptr, "-dm_view"));
   PetscCall(DMGetDimension(dm_, &dim));
-  PulmoUserCheck(dim == 3, comm, "-dm_plex_filename %s holds no volume elements (dimension %d); mesh the volume",
-                 name, static_cast<int>(dim));
+  PulmoUserCheck(dim == 3, comm, "-dm_plex_filename %s holds no volume elements (dimension %d); mesh the volume", name,
+                 static_cast<int>(dim));
   PetscCall(DMGetCoordinatesLocal(dm_, &coordinates));
   PetscCall(VecScale(coordinates, scale_));
   PetscCall(DMGetCoordinates(dm_, &coordinates));
@@ -107,10 +107,12 @@ PetscErrorCode Mesh::read(const Options &options, bool ventilated)
   if (ventilated && !scale_given_) {
     PulmoUserCheck(volume_ >= least_lung, comm,
                    "the mesh %s holds %.3g ml, as if its coordinates were in metres: give -mesh_scale 1000 "
-                   "(or -mesh_scale 1 if that is the size)", name, (double)(volume_ / units::mm3_per_ml));
+                   "(or -mesh_scale 1 if that is the size)",
+                   name, (double)(volume_ / units::mm3_per_ml));
     PulmoUserCheck(volume_ <= largest_lung, comm,
                    "the mesh %s holds %.3g ml, as if its coordinates were in micrometres: give -mesh_scale 0.001 "
-                   "(or -mesh_scale 1 if that is the size)", name, (double)(volume_ / units::mm3_per_ml));
+                   "(or -mesh_scale 1 if that is the size)",
+                   name, (double)(volume_ / units::mm3_per_ml));
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -143,12 +145,13 @@ PetscErrorCode Mesh::check_cells(const Options &options)
     PetscCall(cell_corners(dm_, c, x));
     for (int i = 0; i < 4; ++i)
       for (int j = 0; j < i; ++j)
-        longest = std::max(longest, std::hypot(x[3 * i] - x[3 * j], x[3 * i + 1] - x[3 * j + 1], x[3 * i + 2] - x[3 * j + 2]));
+        longest = std::max(longest,
+                           std::hypot(x[3 * i] - x[3 * j], x[3 * i + 1] - x[3 * j + 1], x[3 * i + 2] - x[3 * j + 2]));
     for (int i = 0; i < 3; ++i)
       for (int d = 0; d < 3; ++d) J[3 * i + d] = x[3 * (i + 1) + d] - x[d];
     // DMPlex numbers the corners of a tetrahedron so that this determinant is negative for a good cell
-    const PetscReal det = -(J[0] * (J[4] * J[8] - J[5] * J[7]) + J[1] * (J[5] * J[6] - J[3] * J[8]) +
-                            J[2] * (J[3] * J[7] - J[4] * J[6]));
+    const PetscReal det =
+        -(J[0] * (J[4] * J[8] - J[5] * J[7]) + J[1] * (J[5] * J[6] - J[3] * J[8]) + J[2] * (J[3] * J[7] - J[4] * J[6]));
     const PetscReal share = longest > 0 ? det / (longest * longest * longest) : 0;
     volume += det / 6;
     if (!(share > degenerate)) ++bad;
@@ -165,7 +168,8 @@ PetscErrorCode Mesh::check_cells(const Options &options)
   cells_ = counts[0];
   volume_ = volume;
   PulmoUserCheck(cells_ > 0, comm, "-dm_plex_filename %s holds no cells", file_.c_str());
-  PulmoUserCheck(counts[2] == 0, comm, "-dm_plex_filename %s holds %d cells that are not tetrahedra; mesh with tetrahedra only",
+  PulmoUserCheck(counts[2] == 0, comm,
+                 "-dm_plex_filename %s holds %d cells that are not tetrahedra; mesh with tetrahedra only",
                  file_.c_str(), static_cast<int>(counts[2]));
   PulmoUserCheck(counts[1] == 0, comm,
                  "-dm_plex_filename %s holds %d inverted or degenerate cells, the worst at (%.6g, %.6g, %.6g) mm with "
@@ -215,8 +219,10 @@ PetscErrorCode Mesh::find_surfaces(const Options &options)
         PetscCall(DMPlexGetSupportSize(dm_, points[i], &support));
         PetscCall(DMPlexComputeCellGeometryFVM(dm_, points[i], &a, nullptr, nullptr));
         ++faces;
-        if (support > 1) ++interior;
-        else area += a;
+        if (support > 1)
+          ++interior;
+        else
+          area += a;
       }
       PetscCall(ISRestoreIndices(points_is, &points));
     }
@@ -227,7 +233,8 @@ PetscErrorCode Mesh::find_surfaces(const Options &options)
     if (found[0] > 0 && found[1] == 0) surfaces_[name] = {label, value, area};
   }
   PulmoUserCheck(!surfaces_.empty(), comm,
-                 "the mesh %s names no surface; give its boundary physical names such as airway and pleura", file_.c_str());
+                 "the mesh %s names no surface; give its boundary physical names such as airway and pleura",
+                 file_.c_str());
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

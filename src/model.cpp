@@ -59,7 +59,8 @@ PetscErrorCode Model::create_fields()
 
   PetscFunctionBeginUser;
   PetscCall(PetscDTSimplexQuadrature(3, quadrature_degree_, PETSCDTSIMPLEXQUAD_MINSYM, rule.out()));
-  PetscCall(PetscDTSimplexQuadrature(2, std::max<PetscInt>(4, quadrature_degree_), PETSCDTSIMPLEXQUAD_MINSYM, face_rule.out()));
+  PetscCall(PetscDTSimplexQuadrature(2, std::max<PetscInt>(4, quadrature_degree_), PETSCDTSIMPLEXQUAD_MINSYM,
+                                     face_rule.out()));
   PetscInt index = 0;
   for (const FieldSpec &field : composition().fields()) {
     FEHandle fe;
@@ -94,9 +95,11 @@ PetscErrorCode Model::create_weak_form()
   PetscCall(PetscDSGetWeakForm(ds, &volume));
   for (const Term &term : composition().terms()) {
     if (term.surface.empty()) {
-      if (term.trial < 0) PetscCall(PetscWeakFormAddResidual(volume, nullptr, 0, term.test, 0, term.f0, term.f1));
+      if (term.trial < 0)
+        PetscCall(PetscWeakFormAddResidual(volume, nullptr, 0, term.test, 0, term.f0, term.f1));
       else
-        PetscCall(PetscWeakFormAddJacobian(volume, nullptr, 0, term.test, term.trial, 0, term.g0, term.g1, term.g2, term.g3));
+        PetscCall(
+            PetscWeakFormAddJacobian(volume, nullptr, 0, term.test, term.trial, 0, term.g0, term.g1, term.g2, term.g3));
       continue;
     }
     DMLabel label;
@@ -105,15 +108,16 @@ PetscErrorCode Model::create_weak_form()
     PetscWeakForm &wf = boundary[{term.surface, term.test}];
     if (!wf) {
       PetscInt bd;
-      PetscCall(DMAddBoundary(dm_, DM_BC_NATURAL, term.surface.c_str(), label, 1, &value, term.test, 0, nullptr, nullptr,
-                              nullptr, nullptr, &bd));
+      PetscCall(DMAddBoundary(dm_, DM_BC_NATURAL, term.surface.c_str(), label, 1, &value, term.test, 0, nullptr,
+                              nullptr, nullptr, nullptr, &bd));
       PetscCall(PetscDSGetBoundary(ds, bd, &wf, nullptr, nullptr, nullptr, nullptr, nullptr, nullptr, nullptr, nullptr,
                                    nullptr, nullptr, nullptr));
     }
-    if (term.trial < 0) PetscCall(PetscWeakFormAddBdResidual(wf, label, value, term.test, 0, term.bd_f0, term.bd_f1));
+    if (term.trial < 0)
+      PetscCall(PetscWeakFormAddBdResidual(wf, label, value, term.test, 0, term.bd_f0, term.bd_f1));
     else
-      PetscCall(PetscWeakFormAddBdJacobian(wf, label, value, term.test, term.trial, 0, term.bd_g0, term.bd_g1, term.bd_g2,
-                                           term.bd_g3));
+      PetscCall(PetscWeakFormAddBdJacobian(wf, label, value, term.test, term.trial, 0, term.bd_g0, term.bd_g1,
+                                           term.bd_g2, term.bd_g3));
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -213,15 +217,17 @@ PetscErrorCode Model::create_section()
       for (int c = 0; c < 3; ++c)
         if (set & (1 << c)) which.push_back(c);
       owned.emplace_back();
-      PetscCall(ISCreateGeneral(PETSC_COMM_SELF, (PetscInt)which.size(), which.data(), PETSC_COPY_VALUES, owned.back().out()));
+      PetscCall(ISCreateGeneral(PETSC_COMM_SELF, (PetscInt)which.size(), which.data(), PETSC_COPY_VALUES,
+                                owned.back().out()));
       bc_components.push_back(owned.back());
       owned.emplace_back();
-      PetscCall(ISCreateGeneral(PETSC_COMM_SELF, (PetscInt)points.size(), points.data(), PETSC_COPY_VALUES, owned.back().out()));
+      PetscCall(ISCreateGeneral(PETSC_COMM_SELF, (PetscInt)points.size(), points.data(), PETSC_COPY_VALUES,
+                                owned.back().out()));
       bc_points.push_back(owned.back());
       bc_field.push_back(f);
     }
-  PetscCall(DMPlexCreateSection(dm_, labels.data(), components.data(), dofs.data(), (PetscInt)bc_field.size(), bc_field.data(),
-                                bc_components.data(), bc_points.data(), nullptr, section.out()));
+  PetscCall(DMPlexCreateSection(dm_, labels.data(), components.data(), dofs.data(), (PetscInt)bc_field.size(),
+                                bc_field.data(), bc_components.data(), bc_points.data(), nullptr, section.out()));
   for (PetscInt f = 0; f < n_fields; ++f) PetscCall(PetscSectionSetFieldName(section, f, fields[f].name.c_str()));
   PetscCall(DMSetLocalSection(dm_, section));
 
@@ -305,8 +311,10 @@ PetscErrorCode Model::residual(PetscReal t, Vec x, Vec x_t, Vec F)
 {
   PetscFunctionBeginUser;
   PetscCall(VecZeroEntries(F));
-  if (own_) PetscCall(assembly_.residual(t, x, x_t, row_scale_.data(), F));
-  else PetscCall(stock_residual(t, x, x_t, F));
+  if (own_)
+    PetscCall(assembly_.residual(t, x, x_t, row_scale_.data(), F));
+  else
+    PetscCall(stock_residual(t, x, x_t, F));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -51,6 +51,15 @@ std::size_t distance(const std::string &a, const std::string &b)
   return row[b.size()];
 }
 
+/// Whether the last `-name` of the list says off.
+bool turned_off(const std::vector<std::pair<std::string, std::string>> &list, const std::string &name)
+{
+  bool off = false;
+  for (const auto &[option, value] : list)
+    if (option == "-" + name) off = value == "off" || value == "false" || value == "no" || value == "0";
+  return off;
+}
+
 } // namespace
 
 std::string Range::text() const
@@ -108,8 +117,8 @@ PetscErrorCode Options::parse_number(const std::string &option, const std::strin
 
   PetscFunctionBeginUser;
   value = std::strtod(raw.c_str(), &end);
-  PulmoUserCheck(!raw.empty() && *end == '\0' && std::isfinite(value), comm_,
-                 "option %s takes a number (%s), not '%s'", option.c_str(), unit.c_str(), raw.c_str());
+  PulmoUserCheck(!raw.empty() && *end == '\0' && std::isfinite(value), comm_, "option %s takes a number (%s), not '%s'",
+                 option.c_str(), unit.c_str(), raw.c_str());
   PulmoUserCheck(range.holds(value), comm_, "option %s %s (%s) is out of range; it must be %s", option.c_str(),
                  raw.c_str(), unit.c_str(), range.text().c_str());
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -223,8 +232,8 @@ PetscErrorCode Options::vector(const std::string &name, const std::string &unit,
   bool is_given;
 
   PetscFunctionBeginUser;
-  PetscCall(find(name, number_text(value[0]) + "," + number_text(value[1]) + "," + number_text(value[2]), unit, "", help,
-                 raw, is_given));
+  PetscCall(find(name, number_text(value[0]) + "," + number_text(value[1]) + "," + number_text(value[2]), unit, "",
+                 help, raw, is_given));
   if (is_given) {
     const auto parts = split(raw, ',');
     PulmoUserCheck(parts.size() == 3, comm_, "option %s takes three numbers (%s) separated by commas, not '%s'",
@@ -264,8 +273,10 @@ PetscErrorCode Options::all_given(std::vector<std::pair<std::string, std::string
   // the database prints "-name value -name value ..."; a value never begins with '-' and a letter
   for (std::string word; stream >> word;) {
     const bool is_name = word.size() > 1 && word[0] == '-' && std::isalpha(static_cast<unsigned char>(word[1]));
-    if (is_name) list.emplace_back(word, "");
-    else if (!list.empty()) list.back().second += (list.back().second.empty() ? "" : " ") + word;
+    if (is_name)
+      list.emplace_back(word, "");
+    else if (!list.empty())
+      list.back().second += (list.back().second.empty() ? "" : " ") + word;
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -281,10 +292,13 @@ PetscErrorCode Options::check_unknown() const
     bool in_use = false;
     for (const Declared &d : declared_) {
       if (d.name != name) continue;
-      if (groups_[d.group].in_use) in_use = true;
-      else idle = &d;
+      if (groups_[d.group].in_use)
+        in_use = true;
+      else
+        idle = &d;
     }
-    if (in_use) continue;
+    // an effect that the user turned off on purpose may keep its settings (from a scene file)
+    if (in_use || (idle && turned_off(list, groups_[idle->group].name))) continue;
     PulmoUserCheck(!idle, comm_, "option %s has no effect in this scene: it needs %s", name.c_str(),
                    groups_[idle->group].enabled_by.c_str());
     for (const Group &group : groups_) {
@@ -318,13 +332,15 @@ PetscErrorCode Options::warn_unused() const
 
 PetscErrorCode Options::print_help() const
 {
-  std::size_t last = groups_.size();
+  std::string last;
 
   PetscFunctionBeginUser;
-  PetscCall(PetscPrintf(comm_, "pulmo's own options (beside PETSc's: -dm_plex_filename, -ts_*, -snes_*, -ksp_*, -pc_*):\n"));
+  PetscCall(
+      PetscPrintf(comm_, "pulmo's own options (beside PETSc's: -dm_plex_filename, -ts_*, -snes_*, -ksp_*, -pc_*):\n"));
   for (const Declared &d : declared_) {
-    if (d.group != last) PetscCall(PetscPrintf(comm_, "\n%s\n", groups_[d.group].about.c_str()));
-    last = d.group;
+    const std::string &about = groups_[d.group].about;
+    if (about != last) PetscCall(PetscPrintf(comm_, "\n%s\n", about.c_str()));
+    last = about;
     PetscCall(PetscPrintf(comm_, "  %-34s %s [%s]%s (default %s)\n", d.name.c_str(), d.help.c_str(), d.unit.c_str(),
                           d.range.empty() || d.range == "any" ? "" : (" " + d.range).c_str(),
                           d.value.empty() ? "none" : d.value.c_str()));

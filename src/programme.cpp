@@ -14,8 +14,8 @@ PetscReal Programme::pressure(PetscReal t) const
 {
   if (phases_.empty()) return 0;
   if (t <= phases_.front().begin) return phases_.front().from;
-  const auto phase = std::lower_bound(phases_.begin(), phases_.end(), t,
-                                      [](const Phase &p, PetscReal time) { return p.end < time; });
+  const auto phase =
+      std::lower_bound(phases_.begin(), phases_.end(), t, [](const Phase &p, PetscReal time) { return p.end < time; });
   return phase == phases_.end() ? phases_.back().pressure(phases_.back().end) : phase->pressure(t);
 }
 

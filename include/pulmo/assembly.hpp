@@ -13,11 +13,11 @@ namespace pulmo {
 
 /// What a state of the lung measures, over all ranks.
 struct Measures {
-  PetscReal volume_change = 0;        ///< int (J - 1) over the reference volume, mm^3
-  PetscReal min_J = 1, max_J = 1;     ///< over quadrature points and cell corners
-  PetscReal min_J_points = 1;         ///< over quadrature points only
-  PetscReal where[3] = {0, 0, 0};     ///< material centroid of the cell with min_J, mm
-  PetscInt cell = -1;                 ///< its number on rank @p rank
+  PetscReal volume_change = 0;    ///< int (J - 1) over the reference volume, mm^3
+  PetscReal min_J = 1, max_J = 1; ///< over quadrature points and cell corners
+  PetscReal min_J_points = 1;     ///< over quadrature points only
+  PetscReal where[3] = {0, 0, 0}; ///< material centroid of the cell with min_J, mm
+  PetscInt cell = -1;             ///< its number on rank @p rank
   PetscMPIInt rank = 0;
 };
 
@@ -57,7 +57,10 @@ private:
 
   PetscErrorCode setup_cells();
   PetscErrorCode setup_facets();
-  void gather(PetscInt cell, const ReadArray &x, PetscScalar *coefficients) const;
+  /// Gathers coefficients in blocks of cells, then of facets, integrates each block and scatters the results.
+  template <class OnCells, class OnFacets, class Scatter>
+  PetscErrorCode for_blocks(Vec x, Vec x_t, PetscInt result_size, OnCells &&on_cells, OnFacets &&on_facets,
+                            Scatter &&scatter);
   PetscFEGeom block_geometry(PetscInt begin, PetscInt n);
   PetscErrorCode map_matrix(Mat A);
   PetscErrorCode add_to_matrix(PetscInt cell, const PetscScalar *matrix, const PetscReal row_scale[], Mat A);

@@ -46,10 +46,10 @@ public:
 
 private:
   struct Prescribed {
-    PetscInt dof;                ///< offset in the local vector
-    std::int16_t constraint;     ///< which of the composition
+    PetscInt dof;            ///< offset in the local vector
+    std::int16_t constraint; ///< which of the composition
     std::int16_t component;
-    PetscReal x[3];              ///< mm
+    PetscReal x[3]; ///< mm
   };
 
   PetscErrorCode create_fields();
