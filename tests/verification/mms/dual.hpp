@@ -5,8 +5,7 @@
 #include <array>
 #include <cmath>
 
-namespace mms
-{
+namespace mms {
 
 template <class T, int N>
 struct Dual {

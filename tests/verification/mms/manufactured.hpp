@@ -7,8 +7,7 @@
 
 #include "verification/mms/dual.hpp"
 
-namespace mms
-{
+namespace mms {
 
 /// Energies, kPa. I3 = J^2.
 struct Berger {

@@ -21,8 +21,7 @@
 using namespace pulmo;
 using namespace pulmo::test;
 
-namespace
-{
+namespace {
 
 constexpr double spring = 0.8; ///< kPa/mm
 
@@ -94,8 +93,7 @@ struct Sources {
 };
 
 template <class Law, class Solution>
-class ManufacturedLoads final : public Effect
-{
+class ManufacturedLoads final : public Effect {
 public:
   explicit ManufacturedLoads(bool weak) : weak_(weak) {}
   const char *name() const override { return "manufactured"; }
@@ -211,8 +209,7 @@ PetscErrorCode errors(DM dm, Vec local, double t, Errors &e)
 }
 
 /// A problem taken apart: residual and Jacobian at states of one's own, without a solver.
-class Bench
-{
+class Bench {
 public:
   template <class Law, class Solution>
   PetscErrorCode setup(const std::string &mesh, double dt, double t)
@@ -347,12 +344,9 @@ PetscErrorCode scatter_values(Vec v, double scale)
 } // namespace
 
 template <class L>
-class Manufactured : public ::testing::Test
-{
-};
+class Manufactured : public ::testing::Test {};
 using Laws = ::testing::Types<mms::Yoshihara, mms::Birzle, mms::Berger, mms::Ma, mms::Rausch>;
-class LawNames
-{
+class LawNames {
 public:
   template <class L>
   static std::string GetName(int)

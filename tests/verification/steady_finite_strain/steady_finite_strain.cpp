@@ -5,8 +5,7 @@
 using namespace pulmo;
 using namespace pulmo::test;
 
-namespace
-{
+namespace {
 
 constexpr double p_in = 0.5, length = 1, area = 0.01;
 

@@ -9,8 +9,7 @@
 #include <cmath>
 #include <cstdio>
 
-namespace pulmo::test::column
-{
+namespace pulmo::test::column {
 
 /// Yoshihara's law (CM4) in uniaxial strain: I1 = J^2 + 2, I3 = J^2, so W' = 2 c J - 2 c J^(-2 beta - 1).
 /// Written from the published W (Table 1 of Aviles-Rojas & Hurtado 2022), not from pulmo's stress.

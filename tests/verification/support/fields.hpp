@@ -7,8 +7,7 @@
 #include <functional>
 #include <vector>
 
-namespace pulmo::test
-{
+namespace pulmo::test {
 
 /// The fields at one point of one cell.
 struct Sample {

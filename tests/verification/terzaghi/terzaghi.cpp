@@ -4,8 +4,7 @@
 using namespace pulmo;
 using namespace pulmo::test;
 
-namespace
-{
+namespace {
 
 constexpr double load = 1e-4; ///< kPa; strains of 1e-5, so that the linear theory holds to 1e-5
 
@@ -15,8 +14,7 @@ struct Result {
 constexpr double times[4] = {0.1, 0.2, 0.5, 1};
 
 /// Keeps the ends of the column after every step.
-class EndsObserver final : public Observer
-{
+class EndsObserver final : public Observer {
 public:
   explicit EndsObserver(DM dm) : dm_(dm) {}
   PetscErrorCode observe(const StepReport &step) override

@@ -11,8 +11,7 @@
 using namespace pulmo;
 using namespace pulmo::test;
 
-namespace
-{
+namespace {
 
 /// k(J) = c J / W''(J): makes dJ/dt = c d2J/dX2.
 struct DiffusivePermeability {
