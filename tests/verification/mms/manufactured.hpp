@@ -9,9 +9,11 @@
 
 namespace mms {
 
-/// Energies, kPa. I3 = J^2.
+/// Energies, kPa; I3 = J^2. `gas` scales the manufactured pressure to the stiffness of the law: with a gas pressure as
+/// large as the shear modulus and dead loads the exact solution is no stable equilibrium.
 struct Berger {
   static constexpr const char *name = "berger";
+  static constexpr double gas = 0.1;
   template <class T>
   static T W(const T &I1, const T &, const T &J)
   {
@@ -21,6 +23,7 @@ struct Berger {
 };
 struct Ma {
   static constexpr const char *name = "ma";
+  static constexpr double gas = 0.1;
   template <class T>
   static T W(const T &I1, const T &I2, const T &)
   {
@@ -31,6 +34,7 @@ struct Ma {
 };
 struct Birzle {
   static constexpr const char *name = "birzle";
+  static constexpr double gas = 0.1;
   template <class T>
   static T W(const T &I1, const T &, const T &J)
   {
@@ -41,6 +45,7 @@ struct Birzle {
 };
 struct Yoshihara {
   static constexpr const char *name = "yoshihara";
+  static constexpr double gas = 1;
   template <class T>
   static T W(const T &I1, const T &, const T &J)
   {
@@ -50,6 +55,7 @@ struct Yoshihara {
 };
 struct Rausch {
   static constexpr const char *name = "rausch";
+  static constexpr double gas = 0.1;
   template <class T>
   static T W(const T &I1, const T &, const T &J)
   {
@@ -60,32 +66,56 @@ struct Rausch {
 };
 
 /// Permeability of the manufactured problems: k = k0 J^2 / (2 - J/2), mm^2/(kPa s). Any smooth law will do.
-constexpr double k0 = 0.8;
+constexpr double k0 = 4;
 template <class T>
 T permeability(const T &J)
 {
   return k0 * (J * J) / (2.0 - 0.5 * J);
 }
 
-/// u and p that no finite element holds: gradients of u up to 0.25, J between about 0.7 and 1.4 at t = 1. X = (x, y, z,
+/// u and p that no finite element holds: strains of 10 to 30 %, J between 0.87 and 1.36 at t = 1. X = (x, y, z,
 /// t).
+template <class Law>
 struct Waves {
   template <class T>
   static void displacement(const T X[4], T u[3])
   {
     const T &x = X[0], &y = X[1], &z = X[2], &t = X[3];
-    u[0] = t * (0.12 * sin(1.7 * x + 0.8 * y - 0.5 * z + 0.3));
-    u[1] = t * (0.10 * cos(1.2 * x - 1.5 * y + 0.9 * z) + 0.06 * y);
-    u[2] = t * (0.11 * sin(0.7 * x + 1.1 * y + 1.6 * z - 0.4));
+    u[0] = t * (0.075 * sin(1.7 * x + 0.8 * y - 0.5 * z + 0.3));
+    u[1] = t * (0.06 * cos(1.2 * x - 1.5 * y + 0.9 * z) + 0.04 * y);
+    u[2] = t * (0.07 * sin(0.7 * x + 1.1 * y + 1.6 * z - 0.4));
   }
   template <class T>
   static T pressure(const T X[4])
   {
-    return 0.3 + 0.25 * sin(1.5 * X[0] - 0.9 * X[1] + 1.2 * X[2] + 0.5 * X[3]);
+    return Law::gas * (0.3 + 0.25 * sin(1.5 * X[0] - 0.9 * X[1] + 1.2 * X[2] + 0.5 * X[3]));
+  }
+};
+
+/// The same u with a p that P1 holds (the flux still varies, with C^-1 and k(J)): shows the order of u by itself.
+template <class Law>
+struct WavesLinearPressure : Waves<Law> {
+  template <class T>
+  static T pressure(const T X[4])
+  {
+    return Law::gas * (0.3 + 0.2 * X[0] - 0.15 * X[1] + 0.25 * X[2] + 0.1 * X[3]);
+  }
+};
+
+/// The same about a stretched state, where a law whose shear modulus vanishes at F = I has one.
+template <class Law>
+struct WavesStretched : WavesLinearPressure<Law> {
+  template <class T>
+  static void displacement(const T X[4], T u[3])
+  {
+    Waves<Law>::displacement(X, u);
+    u[0] = u[0] + 0.25 * (X[3] * X[0]);
+    u[1] = u[1] - 0.15 * (X[3] * X[1]);
   }
 };
 
 /// u in P2 and p in P1 at every time, but no polynomial in time.
+template <class Law>
 struct Polynomials {
   template <class T>
   static void displacement(const T X[4], T u[3])
@@ -99,7 +129,7 @@ struct Polynomials {
   template <class T>
   static T pressure(const T X[4])
   {
-    return (0.2 + 0.3 * sin(2.0 * X[3])) * (1.0 - 0.6 * X[0] + 0.3 * X[1]) + 0.15 * (cos(X[3]) * X[2]);
+    return Law::gas * ((0.2 + 0.3 * sin(2.0 * X[3])) * (1.0 - 0.6 * X[0] + 0.3 * X[1]) + 0.15 * (cos(X[3]) * X[2]));
   }
 };
 

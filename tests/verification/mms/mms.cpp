@@ -178,7 +178,8 @@ std::string options(const char *law, const std::string &mesh, double dt, bool we
 {
   return "-options_file " + source("petsc_options/solvers/tight.opts") + " -dm_plex_filename " +
          source("meshes/" + mesh + ".msh") + " -tissue " + law +
-         " -airflow -airflow_surfaces x1 -airflow_permeability_law rational -ts_max_time 1 -ts_dt " +
+         " -snes_rtol 1e-11 -snes_atol 1e-11 -airflow -airflow_surfaces x1 -airflow_permeability_law rational "
+         "-ts_max_time 1 -ts_dt " +
          std::to_string(dt) +
          (weak ? ""
                : " -lumen_pressure -lumen_pressure_surfaces y1 -chest_wall -chest_wall_surfaces x1 "
@@ -239,6 +240,7 @@ public:
 
   DM dm() { return run_->model().dm(); }
   Model &model() { return run_->model(); }
+  Vec local() { return x_; }     ///< the state of the last residual
   Vec field() { return field_; } ///< 0 or 1: the field of each entry of a global vector
   PetscErrorCode exact(Vec X)    ///< the interpolant
   {
@@ -346,6 +348,11 @@ PetscErrorCode scatter_values(Vec v, double scale)
 template <class L>
 class Manufactured : public ::testing::Test {};
 using Laws = ::testing::Types<mms::Yoshihara, mms::Birzle, mms::Berger, mms::Ma, mms::Rausch>;
+/// Runs from rest. Not rausch: its shear modulus vanishes at F = I, so loads do not decide where it goes, and Newton
+/// ends in another equilibrium of the same discrete equations.
+template <class L>
+class ManufacturedRun : public ::testing::Test {};
+using LawsWithShearModulus = ::testing::Types<mms::Yoshihara, mms::Birzle, mms::Berger, mms::Ma>;
 class LawNames {
 public:
   template <class L>
@@ -355,19 +362,18 @@ public:
   }
 };
 TYPED_TEST_SUITE(Manufactured, Laws, LawNames);
+TYPED_TEST_SUITE(ManufacturedRun, LawsWithShearModulus, LawNames);
 
 /// Laws that get all three meshes; the others two.
 template <class L>
 constexpr bool three_meshes = std::is_same_v<L, mms::Yoshihara> || std::is_same_v<L, mms::Birzle>;
 
-// (a) u in P2: order 3 in L2 and 2 in H1; p in P1: order 2 in L2 and 1 in H1.
-TYPED_TEST(Manufactured, DiscretisationError)
+/// Errors on cube_coarse, cube and (three meshes) cube_fine, h halved each time; four steps of 0.25 s.
+template <class Law, class Solution>
+void convergence(std::vector<Errors> &e)
 {
-  using Law = TypeParam;
-  using Solution = mms::Waves;
   std::vector<std::string> meshes{"cube_coarse", "cube"};
   if (three_meshes<Law>) meshes.push_back("cube_fine");
-  std::vector<Errors> e;
   for (const std::string &mesh : meshes) {
     pulmo::Run run(manufactured<Law, Solution>(false));
     bool finished = false;
@@ -377,22 +383,87 @@ TYPED_TEST(Manufactured, DiscretisationError)
     ASSERT_NEAR(run.simulation().time(), 1, 1e-9);
     e.emplace_back();
     PULMO_OK(errors<Solution>(run.model().dm(), run.simulation().local_state(), 1, e.back()));
-    std::printf("  %-9s %-11s J %.2f..%.2f  u %.3e  Grad u %.3e  p %.3e  Grad p %.3e\n", Law::name, mesh.c_str(),
+    std::printf("  %-9s %-11s J %.2f..%.2f  u %.3e  Grad u %.3e  p %.3e  Grad p %.3e", Law::name, mesh.c_str(),
                 run.simulation().rows().back().min_J, run.simulation().rows().back().max_J, e.back().u, e.back().grad_u,
                 e.back().p, e.back().grad_p);
     if (e.size() > 1) {
       const Errors &c = e[e.size() - 2], &f = e.back();
-      std::printf("  %-9s orders      u %.2f  Grad u %.2f  p %.2f  Grad p %.2f\n", Law::name, order(c.u, f.u),
-                  order(c.grad_u, f.grad_u), order(c.p, f.p), order(c.grad_p, f.grad_p));
+      std::printf("  orders %.2f %.2f %.2f %.2f", order(c.u, f.u), order(c.grad_u, f.grad_u), order(c.p, f.p),
+                  order(c.grad_p, f.grad_p));
     }
+    std::printf("\n");
   }
+  EXPECT_GT(e.back().u, 1e-8) << "an error of nothing means that nothing was tested";
+  EXPECT_GT(e.back().p, 1e-8);
+}
+
+// (a) Neither field is in its space: Grad u and p have order 2, Grad p has order 1. In L2 u has order 2 too: the error
+// of p, which no weaker norm makes smaller for P1, loads the momentum balance.
+TYPED_TEST(ManufacturedRun, DiscretisationError)
+{
+  std::vector<Errors> e;
+  ASSERT_NO_FATAL_FAILURE((convergence<TypeParam, mms::Waves<TypeParam>>(e)));
+  const Errors &c = e[e.size() - 2], &f = e.back();
+  EXPECT_GT(order(c.u, f.u), 1.7);
+  EXPECT_GT(order(c.grad_u, f.grad_u), 1.7);
+  EXPECT_GT(order(c.p, f.p), 1.8);
+  EXPECT_GT(order(c.grad_p, f.grad_p), 0.85);
+}
+
+// (a) p is in its space: u has its own order 3 in L2.
+TYPED_TEST(ManufacturedRun, DiscretisationErrorOfDisplacement)
+{
+  std::vector<Errors> e;
+  ASSERT_NO_FATAL_FAILURE((convergence<TypeParam, mms::WavesLinearPressure<TypeParam>>(e)));
   const Errors &c = e[e.size() - 2], &f = e.back();
   EXPECT_GT(order(c.u, f.u), 2.7);
   EXPECT_GT(order(c.grad_u, f.grad_u), 1.8);
   EXPECT_GT(order(c.p, f.p), 1.8);
-  EXPECT_GT(order(c.grad_p, f.grad_p), 0.9);
-  EXPECT_GT(f.u, 1e-8); // an error of nothing means that nothing was tested
-  EXPECT_GT(f.p, 1e-8);
+}
+
+// (a) For the law that cannot be run from rest: one step about a stretched state, Newton from the interpolant.
+TEST(ManufacturedFromInterpolant, rausch)
+{
+  using Solution = mms::WavesStretched<mms::Rausch>;
+  std::vector<Errors> e;
+  for (const char *mesh : {"cube_coarse", "cube", "cube_fine"}) {
+    Bench bench;
+    VecHandle X, F, D;
+    MatHandle A;
+    double norm[2];
+    PULMO_OK((bench.setup<mms::Rausch, Solution>(mesh, 1, 1)));
+    PULMO_OK(DMCreateGlobalVector(bench.dm(), X.out()));
+    PULMO_OK(VecDuplicate(X, F.out()));
+    PULMO_OK(VecDuplicate(X, D.out()));
+    PULMO_OK(DMCreateMatrix(bench.dm(), A.out()));
+    PULMO_OK(bench.exact(X));
+    for (int i = 0; i < 6; ++i) {
+      KSP ksp;
+      PULMO_OK(bench.residual(X, F));
+      PULMO_OK(bench.jacobian(X, A));
+      PULMO_OK(KSPCreate(PETSC_COMM_WORLD, &ksp));
+      PULMO_OK(KSPSetOperators(ksp, A, A));
+      PULMO_OK(KSPSetFromOptions(ksp)); // the solver file's factorisation
+      PULMO_OK(KSPSolve(ksp, F, D));
+      PULMO_OK(KSPDestroy(&ksp));
+      PULMO_OK(VecAXPY(X, -1, D));
+    }
+    PULMO_OK(bench.residual(X, F));
+    PULMO_OK(bench.norms(F, norm));
+    EXPECT_LT(norm[0], 1e-10);
+    EXPECT_LT(norm[1], 1e-10);
+    e.emplace_back();
+    PULMO_OK(errors<Solution>(bench.dm(), bench.local(), 1, e.back()));
+    std::printf("  %-9s %-11s u %.3e  Grad u %.3e  p %.3e", "rausch", mesh, e.back().u, e.back().grad_u, e.back().p);
+    if (e.size() > 1) {
+      const Errors &c = e[e.size() - 2], &f = e.back();
+      std::printf("  orders %.2f %.2f %.2f", order(c.u, f.u), order(c.grad_u, f.grad_u), order(c.p, f.p));
+    }
+    std::printf("\n");
+  }
+  EXPECT_GT(order(e[1].u, e[2].u), 2.7);
+  EXPECT_GT(order(e[1].grad_u, e[2].grad_u), 1.8);
+  EXPECT_GT(order(e[1].p, e[2].p), 1.8);
 }
 
 // (b) The interpolant of the exact solution nearly solves the discrete equations, and better on finer meshes.
@@ -405,7 +476,7 @@ TYPED_TEST(Manufactured, ResidualOfTheInterpolant)
     Bench bench;
     VecHandle X, F;
     double at_solution[2], at_rest[2];
-    PULMO_OK((bench.setup<Law, mms::Waves>(meshes[m], 1, 1)));
+    PULMO_OK((bench.setup<Law, mms::Waves<Law>>(meshes[m], 1, 1)));
     PULMO_OK(DMCreateGlobalVector(bench.dm(), X.out()));
     PULMO_OK(VecDuplicate(X, F.out()));
     PULMO_OK(bench.exact(X));
@@ -423,7 +494,7 @@ TYPED_TEST(Manufactured, ResidualOfTheInterpolant)
   for (int f = 0; f < 2; ++f) {
     std::printf("  %-9s order of the relative residual, %s: %.2f %.2f\n", Law::name, f ? "mass" : "momentum",
                 order(relative[0][f], relative[1][f]), order(relative[1][f], relative[2][f]));
-    EXPECT_LT(relative[2][f], 0.02);
+    EXPECT_LT(relative[2][f], 0.1);
     EXPECT_GT(order(relative[1][f], relative[2][f]), 1.5);
   }
 }
@@ -436,7 +507,7 @@ TYPED_TEST(Manufactured, JacobianByTaylorOrder)
   VecHandle X, Y, D, F0, F, JD;
   MatHandle A;
   PetscInt n;
-  PULMO_OK((bench.setup<Law, mms::Waves>("cube_coarse", 0.3, 1)));
+  PULMO_OK((bench.setup<Law, mms::Waves<Law>>("cube_coarse", 0.3, 1)));
   PULMO_OK(DMCreateGlobalVector(bench.dm(), X.out()));
   for (VecHandle *v : {&Y, &D, &F0, &F, &JD}) PULMO_OK(VecDuplicate(X, v->out()));
   PULMO_OK(DMCreateMatrix(bench.dm(), A.out()));
@@ -453,9 +524,10 @@ TYPED_TEST(Manufactured, JacobianByTaylorOrder)
         if ((which[i] > 0.5) != (direction == 1)) d[i] = 0;
     }
     PULMO_OK(MatMult(A, D, JD));
+    const int first = 6;
     std::vector<double> remainder[2];
     for (int k = 0; k < 4; ++k) {
-      const double h = std::pow(0.5, k + 4);
+      const double h = std::pow(0.5, k + first);
       double norm[2];
       PULMO_OK(VecWAXPY(Y, h, D, X));
       PULMO_OK(bench.residual(Y, F));
@@ -471,7 +543,7 @@ TYPED_TEST(Manufactured, JacobianByTaylorOrder)
       EXPECT_GT(size[f], 1e-6) << "no derivative here: nothing tested";
       if (direction == pressure) { // both equations are linear in p
         std::printf("  %-9s %-8s by p: remainder %.1e of %.1e\n", Law::name, f ? "mass" : "momentum", r[0],
-                    size[f] / 16);
+                    size[f] / (1 << first));
         EXPECT_LT(r[0], 1e-12 * std::max(size[f], 1.0));
         continue;
       }
@@ -491,7 +563,7 @@ TYPED_TEST(Manufactured, JacobianByFiniteDifferences)
   MatHandle A, dense;
   PetscInt n;
   const double h = 1e-5;
-  PULMO_OK((bench.setup<Law, mms::Waves>("cube_coarse", 0.3, 1)));
+  PULMO_OK((bench.setup<Law, mms::Waves<Law>>("cube_coarse", 0.3, 1)));
   PULMO_OK(DMCreateGlobalVector(bench.dm(), X.out()));
   for (VecHandle *v : {&Y, &Fp, &Fm}) PULMO_OK(VecDuplicate(X, v->out()));
   PULMO_OK(DMCreateMatrix(bench.dm(), A.out()));
@@ -532,10 +604,10 @@ TYPED_TEST(Manufactured, JacobianByFiniteDifferences)
 }
 
 // Backward Euler: order 1, the solution being held exactly in space.
-TYPED_TEST(Manufactured, OrderInTime)
+TYPED_TEST(ManufacturedRun, OrderInTime)
 {
   using Law = TypeParam;
-  using Solution = mms::Polynomials;
+  using Solution = mms::Polynomials<Law>;
   std::vector<Errors> e;
   for (const int steps : {8, 16, 32, 64}) {
     pulmo::Run run(manufactured<Law, Solution>(true));
@@ -587,7 +659,7 @@ TYPED_TEST(Manufactured, SourcesByDifferences)
   const auto at = [&](int direction, double shift) {
     double y[3] = {x[0], x[1], x[2]}, s = t;
     (direction < 3 ? y[direction] : s) += shift;
-    return mms::state<Law, mms::Waves>(s, y);
+    return mms::state<Law, mms::Waves<Law>>(s, y);
   };
   const mms::State s = at(0, 0);
   double B[3] = {0, 0, 0}, div_Q = 0;
