@@ -40,10 +40,11 @@ Assembly::~Assembly()
   delete map_;
 }
 
-PetscErrorCode Assembly::setup(DM dm)
+PetscErrorCode Assembly::setup(DM dm, PetscDS rate_ds)
 {
   PetscFunctionBeginUser;
   dm_ = dm;
+  rate_ds_ = rate_ds;
   PetscCall(DMGetDS(dm, &ds_));
   PetscCall(PetscDSGetNumFields(ds_, &n_fields_));
   PetscCall(IntegrationLog::attach(ds_, &log_));
@@ -175,12 +176,15 @@ PetscErrorCode Assembly::setup_facets()
       PetscCall(
           ISCreateGeneral(PETSC_COMM_SELF, (PetscInt)faces.size(), faces.data(), PETSC_COPY_VALUES, faces_is.out()));
       PetscCall(DMFieldCreateFEGeom(coordinates, faces_is, rule, PETSC_TRUE, &facets->geom));
-      // PETSc tabulates on the reference cell's faces but maps coordinates by the face's own orientation: make the
-      // map of the facet that of the reference cell's face, so that x belongs to the basis functions
+      // PETSc 3.18 gives the maps of the face itself. Gradients need the inverse map of the cell behind it (suppInvJ is
+      // that of the face there), and x belongs to the basis functions, which are tabulated on the reference cell's
+      // faces: set both from the cell.
       PetscFEGeom &g = *facets->geom;
       for (std::size_t i = 0; i < cells.size(); ++i) {
         PetscReal v0[3], R[9], inverse[9], det;
         PetscReal *x = g.v + i * g.numPoints * 3, *J = g.J + i * g.numPoints * 9;
+        for (PetscInt q = 0; q < g.numPoints; ++q)
+          std::copy_n(&invJ_[9 * cells[i]], 9, g.suppInvJ[0] + (i * g.numPoints + q) * 9);
         const PetscReal *cell_J = &J_[9 * cells[i]], *cell_v = &v0_[3 * cells[i]], origin[2] = {-1, -1};
         PetscCall(
             DMPlexComputeCellGeometryFEM(reference, reference_faces[g.face[i][0]], nullptr, v0, R, inverse, &det));
@@ -217,8 +221,8 @@ PetscFEGeom Assembly::block_geometry(PetscInt begin, PetscInt n)
 }
 
 template <class OnCells, class OnFacets, class Scatter>
-PetscErrorCode Assembly::for_blocks(Vec x, Vec x_t, PetscInt result_size, OnCells &&on_cells, OnFacets &&on_facets,
-                                    Scatter &&scatter)
+PetscErrorCode Assembly::for_blocks(Part part, Vec x, Vec x_t, PetscInt result_size, OnCells &&on_cells,
+                                    OnFacets &&on_facets, Scatter &&scatter)
 {
   const std::size_t n_coefficients = static_cast<std::size_t>(block_cells * element_size_);
   std::vector<PetscScalar> u(n_coefficients), u_t(n_coefficients);
@@ -233,8 +237,9 @@ PetscErrorCode Assembly::for_blocks(Vec x, Vec x_t, PetscInt result_size, OnCell
       u_t[i * element_size_ + k] = xts[dofs[k]];
     }
   };
-  for (PetscInt begin = 0, block = 0; begin < cells_; begin += block_cells, ++block) {
-    const PetscInt n = std::min(block_cells, cells_ - begin);
+  const PetscInt n_cells = part == Part::all ? cells_ : 0;
+  for (PetscInt begin = 0, block = 0; begin < n_cells; begin += block_cells, ++block) {
+    const PetscInt n = std::min(block_cells, n_cells - begin);
     PetscFEGeom geom = block_geometry(begin, n);
     for (PetscInt i = 0; i < n; ++i) gather(i, begin + i);
     std::fill(results.begin(), results.end(), 0.0);
@@ -259,7 +264,7 @@ PetscErrorCode Assembly::for_blocks(Vec x, Vec x_t, PetscInt result_size, OnCell
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Assembly::residual(PetscReal t, Vec x, Vec x_t, const PetscReal row_scale[], Vec F)
+PetscErrorCode Assembly::residual(Part part, PetscReal t, Vec x, Vec x_t, const PetscReal row_scale[], Vec F)
 {
   PetscFunctionBeginUser;
   WriteArray f(F);
@@ -273,7 +278,7 @@ PetscErrorCode Assembly::residual(PetscReal t, Vec x, Vec x_t, const PetscReal r
   const auto on_facets = [&](const Facets &facets, PetscInt n, PetscFEGeom *geom, const PetscScalar *u,
                              const PetscScalar *u_t, PetscScalar *vectors) -> PetscErrorCode {
     PetscFunctionBeginUser;
-    PetscCall(PetscFEIntegrateBdResidual(ds_, facets.wf, facets.key, n, geom, u, u_t, nullptr, nullptr, t, vectors));
+    PetscCall(PetscFEIntegrateBdResidual(ds_, facets.wf, facets.key, n, geom, u, u_t, rate_ds_, u_t, t, vectors));
     PetscFunctionReturn(PETSC_SUCCESS);
   };
   const auto scatter = [&](PetscInt cell, const PetscScalar *vector) -> PetscErrorCode {
@@ -281,15 +286,16 @@ PetscErrorCode Assembly::residual(PetscReal t, Vec x, Vec x_t, const PetscReal r
     for (PetscInt i = 0; i < element_size_; ++i) f[dofs[i]] += row_scale[dof_field_[i]] * vector[i];
     return PETSC_SUCCESS;
   };
-  PetscCall(for_blocks(x, x_t, element_size_, on_cells, on_facets, scatter));
+  PetscCall(for_blocks(part, x, x_t, element_size_, on_cells, on_facets, scatter));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Assembly::jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[], Mat A)
+PetscErrorCode Assembly::jacobian(Part part, PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[],
+                                  Mat A)
 {
   PetscFunctionBeginUser;
   PetscCall(map_matrix(A));
-  PetscCall(MatZeroEntries(A));
+  if (part == Part::all) PetscCall(MatZeroEntries(A));
   std::fill(map_->ghost_values.begin(), map_->ghost_values.end(), 0.0);
   if (map_->diagonal) PetscCall(MatSeqAIJGetArray(map_->diagonal, &map_->values[0]));
   if (map_->off_diagonal) PetscCall(MatSeqAIJGetArray(map_->off_diagonal, &map_->values[1]));
@@ -307,15 +313,15 @@ PetscErrorCode Assembly::jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, 
     for (PetscInt trial = 0; trial < n_fields_; ++trial) {
       PetscFormKey key = facets.key;
       key.field = facets.key.field * n_fields_ + trial;
-      PetscCall(compat::integrate_bd_jacobian(PetscFEIntegrateBdJacobian, ds_, facets.wf, key, n, geom, u, u_t, t,
-                                              shift, matrices));
+      PetscCall(compat::integrate_bd_jacobian(PetscFEIntegrateBdJacobian, ds_, facets.wf, key, n, geom, u, u_t,
+                                              rate_ds_, t, shift, matrices));
     }
     PetscFunctionReturn(PETSC_SUCCESS);
   };
   const auto scatter = [&](PetscInt cell, const PetscScalar *matrix) {
     return add_to_matrix(cell, matrix, row_scale, A);
   };
-  PetscCall(for_blocks(x, x_t, element_size_ * element_size_, on_cells, on_facets, scatter));
+  PetscCall(for_blocks(part, x, x_t, element_size_ * element_size_, on_cells, on_facets, scatter));
   if (map_->diagonal) PetscCall(MatSeqAIJRestoreArray(map_->diagonal, &map_->values[0]));
   if (map_->off_diagonal) PetscCall(MatSeqAIJRestoreArray(map_->off_diagonal, &map_->values[1]));
   for (std::size_t r = 0; r < map_->ghost_rows.size(); ++r) {

@@ -17,6 +17,14 @@ constexpr PetscReal same_time = 1e-9;
 /// A step cut below this share of the one asked for ends the run (-ts_adapt_dt_min may end it earlier).
 constexpr PetscReal least_step = 1e-6;
 
+/// So do as many accepted steps in a row below this share of the step asked for: the run only crawls towards a state
+/// that it cannot pass.
+constexpr PetscReal crawling_step = 1e-3;
+constexpr int crawling_steps = 50;
+
+/// Failed attempts that are remembered.
+constexpr std::size_t max_failures = 12;
+
 class Stopwatch {
 public:
   explicit Stopwatch(double &seconds) : seconds_(seconds) { (void)PetscTime(&start_); }
@@ -205,7 +213,7 @@ PetscReal Simulation::landing(PetscReal t) const
 
 PetscReal Simulation::next_step(PetscReal t, PetscReal h, PetscReal growth)
 {
-  if (!failures_.empty())
+  if (cut_)
     dt_ = h; // it took cuts to get here
   else if (h >= dt_ * (1 - same_time))
     dt_ = std::min(wanted_dt_, growth * dt_); // a full step: grow back
@@ -342,7 +350,9 @@ PetscErrorCode Simulation::reject(PetscReal dt, const std::string &reason, Petsc
   TSAdapt adapt;
 
   PetscFunctionBeginUser;
+  if (failures_.size() == max_failures) failures_.erase(failures_.begin());
   failures_.push_back({accepted_.time, dt, reason, newton, measures, inverted});
+  cut_ = true;
   ++rejected_;
   PetscCall(TSGetAdapt(ts_, &adapt));
   const PetscReal next = dt * adapt->scale_solve_failed;
@@ -363,7 +373,9 @@ PetscErrorCode Simulation::after_step()
   if (reason < 0) PetscFunctionReturn(PETSC_SUCCESS); // PETSc calls this after a step that it gave up, too
   PetscCall(TSGetTime(ts_, &t));
   row.dt = t - accepted_.time;
-  failures_.clear();
+  cut_ = false;
+  crawled_ = row.dt < crawling_step * wanted_dt_ && row.time != phase_->end ? crawled_ + 1 : 0;
+  if (crawled_ == 0) failures_.clear();
 
   // state and consistent flux of the accepted step
   PetscCall(model_.set_step(row.dt, scene_.facts().airway_pressure(t)));
@@ -394,6 +406,7 @@ PetscErrorCode Simulation::after_step()
   delivered_ += row.dt * row.flow * units::mm3_per_ml;
   accepted_ = row;
   PetscCall(report(row, measures));
+  if (crawled_ == crawling_steps) PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

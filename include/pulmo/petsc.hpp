@@ -38,6 +38,9 @@ namespace compat {
 #define PULMO_FE_ARGUMENTS                                                                                             \
   PetscFormKey key, PetscInt n, PetscFEGeom *geom, const PetscScalar *u, const PetscScalar *u_t, PetscReal t,          \
       PetscReal shift, PetscScalar *matrices
+#define PULMO_BD_ARGUMENTS                                                                                             \
+  PetscFormKey key, PetscInt n, PetscFEGeom *geom, const PetscScalar *u, const PetscScalar *u_t, PetscDS aux,          \
+      PetscReal t, PetscReal shift, PetscScalar *matrices
 #define PULMO_FE_TYPES                                                                                                 \
   PetscFormKey, PetscInt, PetscFEGeom *, const PetscScalar *, const PetscScalar *, PetscDS, const PetscScalar *,       \
       PetscReal, PetscReal, PetscScalar *
@@ -54,20 +57,21 @@ inline PetscErrorCode integrate_jacobian(PetscErrorCode (*f)(PetscDS, PetscDS, P
   return f(ds, ds, PETSCFE_JACOBIAN, key, n, geom, u, u_t, nullptr, nullptr, t, shift, matrices);
 }
 
-/// PetscFEIntegrateBdJacobian: newer releases take the type of the Jacobian.
+/// PetscFEIntegrateBdJacobian, with the rates as auxiliary field: newer releases take the type of the Jacobian.
 inline PetscErrorCode integrate_bd_jacobian(PetscErrorCode (*f)(PetscDS, PetscWeakForm, PULMO_FE_TYPES), PetscDS ds,
-                                            PetscWeakForm wf, PULMO_FE_ARGUMENTS)
+                                            PetscWeakForm wf, PULMO_BD_ARGUMENTS)
 {
-  return f(ds, wf, key, n, geom, u, u_t, nullptr, nullptr, t, shift, matrices);
+  return f(ds, wf, key, n, geom, u, u_t, aux, u_t, t, shift, matrices);
 }
 inline PetscErrorCode integrate_bd_jacobian(PetscErrorCode (*f)(PetscDS, PetscWeakForm, PetscFEJacobianType,
                                                                 PULMO_FE_TYPES),
-                                            PetscDS ds, PetscWeakForm wf, PULMO_FE_ARGUMENTS)
+                                            PetscDS ds, PetscWeakForm wf, PULMO_BD_ARGUMENTS)
 {
-  return f(ds, wf, PETSCFE_JACOBIAN, key, n, geom, u, u_t, nullptr, nullptr, t, shift, matrices);
+  return f(ds, wf, PETSCFE_JACOBIAN, key, n, geom, u, u_t, aux, u_t, t, shift, matrices);
 }
 
 #undef PULMO_FE_ARGUMENTS
+#undef PULMO_BD_ARGUMENTS
 #undef PULMO_FE_TYPES
 
 } // namespace compat

@@ -101,6 +101,8 @@ private:
   PetscReal delivered_ = 0, worst_balance_ = 0, min_J_ = 1;
   PetscInt newton_ = 0, krylov_ = 0, rejected_ = 0;
   bool inverted_ = false; ///< the attempt at hand met J <= 0
+  bool cut_ = false;      ///< the step at hand was cut
+  int crawled_ = 0;       ///< accepted steps in a row that were tiny
   Measures inverted_measures_;
   std::vector<FailedAttempt> failures_;
   StageSeconds seconds_;
