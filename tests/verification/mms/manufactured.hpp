@@ -102,18 +102,6 @@ struct WavesLinearPressure : Waves<Law> {
   }
 };
 
-/// The same about a stretched state, where a law whose shear modulus vanishes at F = I has one.
-template <class Law>
-struct WavesStretched : WavesLinearPressure<Law> {
-  template <class T>
-  static void displacement(const T X[4], T u[3])
-  {
-    Waves<Law>::displacement(X, u);
-    u[0] = u[0] + 0.25 * (X[3] * X[0]);
-    u[1] = u[1] - 0.15 * (X[3] * X[1]);
-  }
-};
-
 /// u in P2 and p in P1 at every time, but no polynomial in time.
 template <class Law>
 struct Polynomials {
