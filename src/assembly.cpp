@@ -19,16 +19,16 @@ struct Assembly::Facets {
 /// Where the entries of element matrices go in a sparse matrix. Dofs of one mesh point are neighbours in every
 /// row, and all rows of a mesh point have the same pattern: one offset per pair of mesh points of a cell is enough.
 struct Assembly::MatrixMap {
-  Mat matrix = nullptr;                     ///< identity only, not owned
-  bool direct = false;                      ///< AIJ: entries are added in place
+  Mat matrix = nullptr; ///< identity only, not owned
+  bool direct = false;  ///< AIJ: entries are added in place
   Mat diagonal = nullptr, off_diagonal = nullptr;
   const PetscInt *row_begin[2] = {nullptr, nullptr}; ///< CSR row pointers of the two parts
   PetscScalar *values[2] = {nullptr, nullptr};       ///< their entries, while a Jacobian is assembled
-  std::vector<std::int32_t> offset;         ///< [cell][row point][column point]
-  std::vector<PetscInt> global;             ///< [local dof]: global number of a free dof, -1 if constrained
-  std::vector<PetscInt> row;                ///< [local dof]: owned: local row; ghost: -(ghost row) - 1
-  std::vector<std::int8_t> free_index;      ///< [local dof]: place among the free dofs of its mesh point, -1 constrained
-  std::vector<std::uint8_t> owned;          ///< [mesh point]
+  std::vector<std::int32_t> offset;                  ///< [cell][row point][column point]
+  std::vector<PetscInt> global;                      ///< [local dof]: global number of a free dof, -1 if constrained
+  std::vector<PetscInt> row;                         ///< [local dof]: owned: local row; ghost: -(ghost row) - 1
+  std::vector<std::int8_t> free_index; ///< [local dof]: place among the free dofs of its mesh point, -1 constrained
+  std::vector<std::uint8_t> owned;     ///< [mesh point]
   // rows of other ranks, summed here and sent once
   std::vector<PetscInt> ghost_begin, ghost_columns, ghost_rows;
   std::vector<PetscScalar> ghost_values;
@@ -40,10 +40,11 @@ Assembly::~Assembly()
   delete map_;
 }
 
-PetscErrorCode Assembly::setup(DM dm)
+PetscErrorCode Assembly::setup(DM dm, PetscDS rate_ds)
 {
   PetscFunctionBeginUser;
   dm_ = dm;
+  rate_ds_ = rate_ds;
   PetscCall(DMGetDS(dm, &ds_));
   PetscCall(PetscDSGetNumFields(ds_, &n_fields_));
   PetscCall(IntegrationLog::attach(ds_, &log_));
@@ -70,7 +71,8 @@ PetscErrorCode Assembly::setup_cells()
   for (PetscInt c = 0; c < cells_; ++c) {
     PetscInt *closure = nullptr, n_closure, n = 0;
     std::vector<PetscInt> points;
-    PetscCall(DMPlexComputeCellGeometryAffineFEM(dm_, first_cell_ + c, &v0_[3 * c], &J_[9 * c], &invJ_[9 * c], &detJ_[c]));
+    PetscCall(
+        DMPlexComputeCellGeometryAffineFEM(dm_, first_cell_ + c, &v0_[3 * c], &J_[9 * c], &invJ_[9 * c], &detJ_[c]));
     PetscCall(DMPlexGetTransitiveClosure(dm_, first_cell_ + c, PETSC_TRUE, &n_closure, &closure));
     for (PetscInt f = 0; f < n_fields_; ++f)
       for (PetscInt i = 0; i < n_closure; ++i) {
@@ -115,8 +117,7 @@ PetscErrorCode Assembly::setup_cells()
   nodes_ = T->Nb / T->Nc;
   for (PetscInt q = 0; q < sample_points_; ++q)
     for (PetscInt a = 0; a < nodes_; ++a)
-      for (PetscInt d = 0; d < 3; ++d)
-        sample_gradients_.push_back(T->T[1][((q * T->Nb + a * T->Nc) * T->Nc) * 3 + d]);
+      for (PetscInt d = 0; d < 3; ++d) sample_gradients_.push_back(T->T[1][((q * T->Nb + a * T->Nc) * T->Nc) * 3 + d]);
   PetscCall(PetscTabulationDestroy(&T));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -172,16 +173,21 @@ PetscErrorCode Assembly::setup_facets()
       facets->wf = wf;
       facets->key = {label, values[v], field, 0};
       facets->cells = cells;
-      PetscCall(ISCreateGeneral(PETSC_COMM_SELF, (PetscInt)faces.size(), faces.data(), PETSC_COPY_VALUES, faces_is.out()));
+      PetscCall(
+          ISCreateGeneral(PETSC_COMM_SELF, (PetscInt)faces.size(), faces.data(), PETSC_COPY_VALUES, faces_is.out()));
       PetscCall(DMFieldCreateFEGeom(coordinates, faces_is, rule, PETSC_TRUE, &facets->geom));
-      // PETSc tabulates on the reference cell's faces but maps coordinates by the face's own orientation: make the
-      // map of the facet that of the reference cell's face, so that x belongs to the basis functions
+      // PETSc 3.18 gives the maps of the face itself. Gradients need the inverse map of the cell behind it (suppInvJ is
+      // that of the face there), and x belongs to the basis functions, which are tabulated on the reference cell's
+      // faces: set both from the cell.
       PetscFEGeom &g = *facets->geom;
       for (std::size_t i = 0; i < cells.size(); ++i) {
         PetscReal v0[3], R[9], inverse[9], det;
         PetscReal *x = g.v + i * g.numPoints * 3, *J = g.J + i * g.numPoints * 9;
+        for (PetscInt q = 0; q < g.numPoints; ++q)
+          std::copy_n(&invJ_[9 * cells[i]], 9, g.suppInvJ[0] + (i * g.numPoints + q) * 9);
         const PetscReal *cell_J = &J_[9 * cells[i]], *cell_v = &v0_[3 * cells[i]], origin[2] = {-1, -1};
-        PetscCall(DMPlexComputeCellGeometryFEM(reference, reference_faces[g.face[i][0]], nullptr, v0, R, inverse, &det));
+        PetscCall(
+            DMPlexComputeCellGeometryFEM(reference, reference_faces[g.face[i][0]], nullptr, v0, R, inverse, &det));
         for (int r = 0; r < 3; ++r) {
           x[r] = cell_v[r];
           for (int d = 0; d < 3; ++d) {
@@ -196,12 +202,6 @@ PetscErrorCode Assembly::setup_facets()
     }
   }
   PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-void Assembly::gather(PetscInt cell, const ReadArray &x, PetscScalar *coefficients) const
-{
-  const PetscInt *dofs = cell_dofs(cell);
-  for (PetscInt i = 0; i < element_size_; ++i) coefficients[i] = x[dofs[i]];
 }
 
 PetscFEGeom Assembly::block_geometry(PetscInt begin, PetscInt n)
@@ -220,32 +220,32 @@ PetscFEGeom Assembly::block_geometry(PetscInt begin, PetscInt n)
   return geom;
 }
 
-PetscErrorCode Assembly::residual(PetscReal t, Vec x, Vec x_t, const PetscReal row_scale[], Vec F)
+template <class OnCells, class OnFacets, class Scatter>
+PetscErrorCode Assembly::for_blocks(Part part, Vec x, Vec x_t, PetscInt result_size, OnCells &&on_cells,
+                                    OnFacets &&on_facets, Scatter &&scatter)
 {
-  const std::size_t size = static_cast<std::size_t>(block_cells * element_size_);
-  std::vector<PetscScalar> u(size), u_t(size), vectors(size);
+  const std::size_t n_coefficients = static_cast<std::size_t>(block_cells * element_size_);
+  std::vector<PetscScalar> u(n_coefficients), u_t(n_coefficients);
+  std::vector<PetscScalar> results(static_cast<std::size_t>(block_cells * result_size));
 
   PetscFunctionBeginUser;
   const ReadArray xs(x), xts(x_t);
-  WriteArray f(F);
-  const auto scatter = [&](PetscInt cell, const PetscScalar *vector) {
+  const auto gather = [&](PetscInt i, PetscInt cell) {
     const PetscInt *dofs = cell_dofs(cell);
-    for (PetscInt i = 0; i < element_size_; ++i) f[dofs[i]] += row_scale[dof_field_[i]] * vector[i];
-  };
-
-  for (PetscInt begin = 0, block = 0; begin < cells_; begin += block_cells, ++block) {
-    const PetscInt n = std::min(block_cells, cells_ - begin);
-    PetscFEGeom geom = block_geometry(begin, n);
-    for (PetscInt c = 0; c < n; ++c) {
-      gather(begin + c, xs, &u[c * element_size_]);
-      gather(begin + c, xts, &u_t[c * element_size_]);
+    for (PetscInt k = 0; k < element_size_; ++k) {
+      u[i * element_size_ + k] = xs[dofs[k]];
+      u_t[i * element_size_ + k] = xts[dofs[k]];
     }
-    std::fill(vectors.begin(), vectors.end(), 0.0);
+  };
+  const PetscInt n_cells = part == Part::all ? cells_ : 0;
+  for (PetscInt begin = 0, block = 0; begin < n_cells; begin += block_cells, ++block) {
+    const PetscInt n = std::min(block_cells, n_cells - begin);
+    PetscFEGeom geom = block_geometry(begin, n);
+    for (PetscInt i = 0; i < n; ++i) gather(i, begin + i);
+    std::fill(results.begin(), results.end(), 0.0);
     log_.timing = block % timed_share == 0;
-    for (PetscInt field = 0; field < n_fields_; ++field)
-      PetscCall(PetscFEIntegrateResidual(ds_, {nullptr, 0, field, 0}, n, &geom, u.data(), u_t.data(), nullptr, nullptr, t,
-                                         vectors.data()));
-    for (PetscInt c = 0; c < n; ++c) scatter(begin + c, &vectors[c * element_size_]);
+    PetscCall(on_cells(n, &geom, u.data(), u_t.data(), results.data()));
+    for (PetscInt i = 0; i < n; ++i) PetscCall(scatter(begin + i, &results[i * result_size]));
   }
   log_.timing = false;
   for (const Facets *facets : facets_) {
@@ -253,71 +253,75 @@ PetscErrorCode Assembly::residual(PetscReal t, Vec x, Vec x_t, const PetscReal r
     for (PetscInt begin = 0; begin < total; begin += block_cells) {
       const PetscInt n = std::min(block_cells, total - begin);
       PetscFEGeom *chunk = nullptr;
-      for (PetscInt i = 0; i < n; ++i) {
-        gather(facets->cells[begin + i], xs, &u[i * element_size_]);
-        gather(facets->cells[begin + i], xts, &u_t[i * element_size_]);
-      }
-      std::fill(vectors.begin(), vectors.end(), 0.0);
+      for (PetscInt i = 0; i < n; ++i) gather(i, facets->cells[begin + i]);
+      std::fill(results.begin(), results.end(), 0.0);
       PetscCall(PetscFEGeomGetChunk(facets->geom, begin, begin + n, &chunk));
-      PetscCall(PetscFEIntegrateBdResidual(ds_, facets->wf, facets->key, n, chunk, u.data(), u_t.data(), nullptr, nullptr, t,
-                                           vectors.data()));
+      PetscCall(on_facets(*facets, n, chunk, u.data(), u_t.data(), results.data()));
       PetscCall(PetscFEGeomRestoreChunk(facets->geom, begin, begin + n, &chunk));
-      for (PetscInt i = 0; i < n; ++i) scatter(facets->cells[begin + i], &vectors[i * element_size_]);
+      for (PetscInt i = 0; i < n; ++i) PetscCall(scatter(facets->cells[begin + i], &results[i * result_size]));
     }
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Assembly::jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[], Mat A)
+PetscErrorCode Assembly::residual(Part part, PetscReal t, Vec x, Vec x_t, const PetscReal row_scale[], Vec F)
 {
-  const std::size_t size = static_cast<std::size_t>(block_cells * element_size_);
-  std::vector<PetscScalar> u(size), u_t(size), matrices(size * element_size_);
-
   PetscFunctionBeginUser;
-  const ReadArray xs(x), xts(x_t);
+  WriteArray f(F);
+  const auto on_cells = [&](PetscInt n, PetscFEGeom *geom, const PetscScalar *u, const PetscScalar *u_t,
+                            PetscScalar *vectors) -> PetscErrorCode {
+    PetscFunctionBeginUser;
+    for (PetscInt field = 0; field < n_fields_; ++field)
+      PetscCall(PetscFEIntegrateResidual(ds_, {nullptr, 0, field, 0}, n, geom, u, u_t, nullptr, nullptr, t, vectors));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  };
+  const auto on_facets = [&](const Facets &facets, PetscInt n, PetscFEGeom *geom, const PetscScalar *u,
+                             const PetscScalar *u_t, PetscScalar *vectors) -> PetscErrorCode {
+    PetscFunctionBeginUser;
+    PetscCall(PetscFEIntegrateBdResidual(ds_, facets.wf, facets.key, n, geom, u, u_t, rate_ds_, u_t, t, vectors));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  };
+  const auto scatter = [&](PetscInt cell, const PetscScalar *vector) -> PetscErrorCode {
+    const PetscInt *dofs = cell_dofs(cell);
+    for (PetscInt i = 0; i < element_size_; ++i) f[dofs[i]] += row_scale[dof_field_[i]] * vector[i];
+    return PETSC_SUCCESS;
+  };
+  PetscCall(for_blocks(part, x, x_t, element_size_, on_cells, on_facets, scatter));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Assembly::jacobian(Part part, PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[],
+                                  Mat A)
+{
+  PetscFunctionBeginUser;
   PetscCall(map_matrix(A));
-  PetscCall(MatZeroEntries(A));
+  if (part == Part::all) PetscCall(MatZeroEntries(A));
   std::fill(map_->ghost_values.begin(), map_->ghost_values.end(), 0.0);
   if (map_->diagonal) PetscCall(MatSeqAIJGetArray(map_->diagonal, &map_->values[0]));
   if (map_->off_diagonal) PetscCall(MatSeqAIJGetArray(map_->off_diagonal, &map_->values[1]));
-  for (PetscInt begin = 0, block = 0; begin < cells_; begin += block_cells, ++block) {
-    const PetscInt n = std::min(block_cells, cells_ - begin);
-    PetscFEGeom geom = block_geometry(begin, n);
-    for (PetscInt c = 0; c < n; ++c) {
-      gather(begin + c, xs, &u[c * element_size_]);
-      gather(begin + c, xts, &u_t[c * element_size_]);
-    }
-    std::fill(matrices.begin(), matrices.end(), 0.0);
-    log_.timing = block % timed_share == 0;
+  const auto on_cells = [&](PetscInt n, PetscFEGeom *geom, const PetscScalar *u, const PetscScalar *u_t,
+                            PetscScalar *matrices) -> PetscErrorCode {
+    PetscFunctionBeginUser;
     for (PetscInt pair = 0; pair < n_fields_ * n_fields_; ++pair)
-      PetscCall(PetscFEIntegrateJacobian(ds_, PETSCFE_JACOBIAN, {nullptr, 0, pair, 0}, n, &geom, u.data(), u_t.data(),
-                                         nullptr, nullptr, t, shift, matrices.data()));
-    for (PetscInt c = 0; c < n; ++c)
-      PetscCall(add_to_matrix(begin + c, &matrices[c * element_size_ * element_size_], row_scale, A));
-  }
-  log_.timing = false;
-  for (const Facets *facets : facets_) {
-    const auto total = static_cast<PetscInt>(facets->cells.size());
-    for (PetscInt begin = 0; begin < total; begin += block_cells) {
-      const PetscInt n = std::min(block_cells, total - begin);
-      PetscFEGeom *chunk = nullptr;
-      for (PetscInt i = 0; i < n; ++i) {
-        gather(facets->cells[begin + i], xs, &u[i * element_size_]);
-        gather(facets->cells[begin + i], xts, &u_t[i * element_size_]);
-      }
-      std::fill(matrices.begin(), matrices.end(), 0.0);
-      PetscCall(PetscFEGeomGetChunk(facets->geom, begin, begin + n, &chunk));
-      for (PetscInt trial = 0; trial < n_fields_; ++trial) {
-        PetscFormKey key = facets->key;
-        key.field = facets->key.field * n_fields_ + trial;
-        PetscCall(PetscFEIntegrateBdJacobian(ds_, facets->wf, key, n, chunk, u.data(), u_t.data(), nullptr, nullptr, t, shift,
-                                             matrices.data()));
-      }
-      PetscCall(PetscFEGeomRestoreChunk(facets->geom, begin, begin + n, &chunk));
-      for (PetscInt i = 0; i < n; ++i)
-        PetscCall(add_to_matrix(facets->cells[begin + i], &matrices[i * element_size_ * element_size_], row_scale, A));
+      PetscCall(compat::integrate_jacobian(PetscFEIntegrateJacobian, ds_, {nullptr, 0, pair, 0}, n, geom, u, u_t, t,
+                                           shift, matrices));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  };
+  const auto on_facets = [&](const Facets &facets, PetscInt n, PetscFEGeom *geom, const PetscScalar *u,
+                             const PetscScalar *u_t, PetscScalar *matrices) -> PetscErrorCode {
+    PetscFunctionBeginUser;
+    for (PetscInt trial = 0; trial < n_fields_; ++trial) {
+      PetscFormKey key = facets.key;
+      key.field = facets.key.field * n_fields_ + trial;
+      PetscCall(compat::integrate_bd_jacobian(PetscFEIntegrateBdJacobian, ds_, facets.wf, key, n, geom, u, u_t,
+                                              rate_ds_, t, shift, matrices));
     }
-  }
+    PetscFunctionReturn(PETSC_SUCCESS);
+  };
+  const auto scatter = [&](PetscInt cell, const PetscScalar *matrix) {
+    return add_to_matrix(cell, matrix, row_scale, A);
+  };
+  PetscCall(for_blocks(part, x, x_t, element_size_ * element_size_, on_cells, on_facets, scatter));
   if (map_->diagonal) PetscCall(MatSeqAIJRestoreArray(map_->diagonal, &map_->values[0]));
   if (map_->off_diagonal) PetscCall(MatSeqAIJRestoreArray(map_->off_diagonal, &map_->values[1]));
   for (std::size_t r = 0; r < map_->ghost_rows.size(); ++r) {
@@ -437,7 +441,8 @@ PetscErrorCode Assembly::map_matrix(Mat A)
         }
         const int part = m.owned[points[j]] ? 0 : 1;
         PetscInt column = first_free[points[j]];
-        if (part == 0) column -= row_begin;
+        if (part == 0)
+          column -= row_begin;
         else {
           const PetscInt *place = std::lower_bound(garray, garray + n_garray, column);
           PetscCheck(place < garray + n_garray && *place == column, PETSC_COMM_SELF, PETSC_ERR_PLIB,
@@ -445,7 +450,8 @@ PetscErrorCode Assembly::map_matrix(Mat A)
           column = static_cast<PetscInt>(place - garray);
         }
         const PetscInt row = first_free[points[i]] - row_begin;
-        const PetscInt *begin = columns[part] + m.row_begin[part][row], *end = columns[part] + m.row_begin[part][row + 1];
+        const PetscInt *begin = columns[part] + m.row_begin[part][row],
+                       *end = columns[part] + m.row_begin[part][row + 1];
         const PetscInt *place = std::lower_bound(begin, end, column);
         PetscCheck(place < end && *place == column, PETSC_COMM_SELF, PETSC_ERR_PLIB,
                    "the matrix pattern lacks an entry of the element matrices");
@@ -464,7 +470,8 @@ PetscErrorCode Assembly::add_to_matrix(PetscInt cell, const PetscScalar *matrix,
   const PetscInt *dofs = cell_dofs(cell), *points = &cell_points_[cell * points_per_cell_];
 
   PetscFunctionBeginHot;
-  PetscCheck(element_size_ <= max_size, PETSC_COMM_SELF, PETSC_ERR_SUP, "elements with more than %d dofs", (int)max_size);
+  PetscCheck(element_size_ <= max_size, PETSC_COMM_SELF, PETSC_ERR_SUP, "elements with more than %d dofs",
+             (int)max_size);
   if (!m.direct) {
     PetscScalar scaled[max_size];
     PetscInt columns[max_size];
@@ -513,7 +520,8 @@ PetscErrorCode Assembly::add_to_matrix(PetscInt cell, const PetscScalar *matrix,
 }
 
 /// Grad u at sample point @p q of cell @p c from the cell's displacements.
-static void sample_gradient(const PetscReal *D, const PetscReal *inverse, PetscInt nodes, const PetscScalar *u, PetscScalar H[9])
+static void sample_gradient(const PetscReal *D, const PetscReal *inverse, PetscInt nodes, const PetscScalar *u,
+                            PetscScalar H[9])
 {
   PetscScalar A[9] = {0};
   for (PetscInt a = 0; a < nodes; ++a)
@@ -562,7 +570,7 @@ PetscErrorCode Assembly::measure(Vec x, Measures &measures) const
       extremes[0] = std::max(extremes[0], J);
       if (q < n_rule) {
         sum += sample_weights_[q] * Jm1;
-        extremes[1] = std::max(extremes[1], -J);
+        extremes[1] = std::max(extremes[1], std::isnan(J) ? PETSC_MAX_REAL : -J);
       }
       if (!(J >= least.value)) { // also taken when J is not a number
         least.value = std::isnan(J) ? -PETSC_MAX_REAL : J;
@@ -582,7 +590,8 @@ PetscErrorCode Assembly::measure(Vec x, Measures &measures) const
   measures.cell = where;
   if (winner.rank == least.rank && where >= 0)
     for (int d = 0; d < 3; ++d) // reference coordinates of the centroid are -1/2
-      measures.where[d] = v0_[3 * where + d] + (J_[9 * where + 3 * d] + J_[9 * where + 3 * d + 1] + J_[9 * where + 3 * d + 2]) / 2;
+      measures.where[d] =
+          v0_[3 * where + d] + (J_[9 * where + 3 * d] + J_[9 * where + 3 * d + 1] + J_[9 * where + 3 * d + 2]) / 2;
   PetscCallMPI(MPI_Bcast(measures.where, 3, MPIU_REAL, winner.rank, comm));
   PetscCallMPI(MPI_Bcast(&measures.cell, 1, MPIU_INT, winner.rank, comm));
   PetscFunctionReturn(PETSC_SUCCESS);

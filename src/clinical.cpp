@@ -28,7 +28,7 @@ void fit_single_compartment(const std::vector<SignalRow> &rows, std::size_t firs
 {
   const double start = rows[first].volume;
   double VV = 0, VQ = 0, QQ = 0, PV = 0, PQ = 0; // normal equations
-  for (std::size_t i = first; i <= last; ++i) {
+  for (std::size_t i = first + 1; i <= last; ++i) {
     const SignalRow &r = rows[i];
     const double P = r.pressure - peep, V = r.volume - start, Q = r.flow, w = r.dt;
     VV += w * V * V;

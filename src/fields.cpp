@@ -14,7 +14,8 @@ namespace {
 constexpr std::array<std::array<int, 2>, 6> edges{{{0, 1}, {1, 2}, {0, 2}, {0, 3}, {1, 3}, {2, 3}}};
 
 /// Writes a block of values as dataset @p name, @p components per entry.
-PetscErrorCode write_values(PetscViewer viewer, const char *name, PetscInt components, const std::vector<PetscScalar> &values)
+PetscErrorCode write_values(PetscViewer viewer, const char *name, PetscInt components,
+                            const std::vector<PetscScalar> &values)
 {
   VecHandle v;
   const MPI_Comm comm = PetscObjectComm((PetscObject)viewer);
@@ -214,7 +215,8 @@ PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
       law.stress(s, P);
       for (int i = 0; i < 3; ++i)
         for (int j = 0; j < 3; ++j) // Cauchy: P F^T / J
-          sigma[3 * i + j] = (P[3 * i] * s.F[3 * j] + P[3 * i + 1] * s.F[3 * j + 1] + P[3 * i + 2] * s.F[3 * j + 2]) / s.J;
+          sigma[3 * i + j] =
+              (P[3 * i] * s.F[3 * j] + P[3 * i + 1] * s.F[3 * j + 1] + P[3 * i + 2] * s.F[3 * j + 2]) / s.J;
       const PetscScalar h = (sigma[0] + sigma[4] + sigma[8]) / 3;
       PetscScalar deviator[9];
       for (int i = 0; i < 9; ++i) deviator[i] = sigma[i] - (i % 4 == 0 ? h : 0);
@@ -255,8 +257,8 @@ PetscErrorCode FieldWriter::write_index() const
     const std::string file = output_.path("fields.xdmf"), part = file + ".part";
     std::ofstream f(part);
     const auto item = [&](const char *h5, const char *dataset, PetscInt rows, PetscInt columns, const char *type) {
-      f << "<DataItem Format=\"HDF\" NumberType=\"" << type << "\" Precision=\"" << (type[0] == 'I' ? sizeof(PetscInt) : 8)
-        << "\" Dimensions=\"" << rows;
+      f << "<DataItem Format=\"HDF\" NumberType=\"" << type << "\" Precision=\""
+        << (type[0] == 'I' ? sizeof(PetscInt) : 8) << "\" Dimensions=\"" << rows;
       if (columns > 1) f << " " << columns;
       f << "\">" << h5 << ":/" << dataset << "</DataItem>";
     };
@@ -266,8 +268,8 @@ PetscErrorCode FieldWriter::write_index() const
     for (std::size_t k = 0; k < times_.size(); ++k) {
       const std::string h5 = snapshot_name(k);
       const auto attribute = [&](const char *name, const char *centre, PetscInt rows, PetscInt columns) {
-        f << "  <Attribute Name=\"" << name << "\" AttributeType=\"" << (columns == 3 ? "Vector" : "Scalar") << "\" Center=\""
-          << centre << "\">";
+        f << "  <Attribute Name=\"" << name << "\" AttributeType=\"" << (columns == 3 ? "Vector" : "Scalar")
+          << "\" Center=\"" << centre << "\">";
         item(h5.c_str(), name, rows, columns, "Float");
         f << "</Attribute>\n";
       };

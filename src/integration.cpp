@@ -6,6 +6,8 @@
 
 #include <cstdlib>
 #include <new>
+#include <optional>
+#include <type_traits>
 
 PETSC_EXTERN PetscErrorCode PetscFECreate_Basic(PetscFE);
 
@@ -75,7 +77,8 @@ inline void product_rows(PetscInt rows, PetscInt rank, const double *L, PetscInt
   for (; a < rows; ++a) product_tile<1, Vectors>(rank, L + a, lda, R, ldb, K + a * ldb);
 }
 
-inline void product(PetscInt rows, PetscInt rank, const double *L, PetscInt lda, const double *R, PetscInt ldb, double *K)
+inline void product(PetscInt rows, PetscInt rank, const double *L, PetscInt lda, const double *R, PetscInt ldb,
+                    double *K)
 {
   PetscInt b = 0;
   for (; b + 12 <= ldb; b += 12) product_rows<3>(rows, rank, L, lda, R + b, ldb, K + b);
@@ -143,14 +146,14 @@ PetscErrorCode make_fields(PetscDS ds, PetscTabulation *T, PetscInt replica, Scr
 
 /// Everything that callbacks read at the points of one cell or face.
 struct PointData {
-  const Fields &fields;
+  const Fields *fields;
   PetscScalar *gradients[max_fields]; ///< [point][dim][stride], real space
   PetscScalar *u, *u_t, *u_x;         ///< [point][...] with the offsets of Fields
   PetscScalar *weights;               ///< quadrature weight times det J
   PetscReal *x, *normals;             ///< [point][3]
   std::vector<PointState> states;
 
-  PointData(const Fields &f, Scratch &scratch) : fields(f), states(static_cast<std::size_t>(f.points))
+  PointData(const Fields &f, Scratch &scratch) : fields(&f), states(static_cast<std::size_t>(f.points))
   {
     for (PetscInt i = 0; i < f.n; ++i) gradients[i] = scratch.take(f.points * dim * f.basis[i].stride);
     u = scratch.take(f.points * f.total_components);
@@ -170,11 +173,11 @@ struct PointData {
   /// Gradients in real space, field values, rates and kinematic states from the element's coefficients.
   void evaluate(const PetscReal inverse_J[9], const PetscScalar coefficients[], const PetscScalar coefficients_t[])
   {
-    const PetscInt Nc = fields.total_components;
-    for (PetscInt f = 0; f < fields.n; ++f) {
-      const ScalarBasis &basis = fields.basis[f];
+    const PetscInt Nc = fields->total_components;
+    for (PetscInt f = 0; f < fields->n; ++f) {
+      const ScalarBasis &basis = fields->basis[f];
       const PetscInt n = basis.stride;
-      for (PetscInt q = 0; q < fields.points; ++q) {
+      for (PetscInt q = 0; q < fields->points; ++q) {
         const PetscScalar *D = basis.derivatives + q * dim * n;
         PetscScalar *G = gradients[f] + q * dim * n;
         for (PetscInt d = 0; d < dim; ++d)
@@ -182,10 +185,10 @@ struct PointData {
             G[d * n + a] = inverse_J[d] * D[a] + inverse_J[dim + d] * D[n + a] + inverse_J[2 * dim + d] * D[2 * n + a];
       }
     }
-    for (PetscInt q = 0; q < fields.points; ++q) {
+    for (PetscInt q = 0; q < fields->points; ++q) {
       PetscScalar rate_x[9];
-      for (PetscInt f = 0; f < fields.n; ++f) {
-        const ScalarBasis &basis = fields.basis[f];
+      for (PetscInt f = 0; f < fields->n; ++f) {
+        const ScalarBasis &basis = fields->basis[f];
         const PetscInt n = basis.stride, C = basis.components;
         const PetscScalar *B = basis.values + q * n, *G = gradients[f] + q * dim * n;
         for (PetscInt c = 0; c < C; ++c) {
@@ -202,15 +205,15 @@ struct PointData {
               for (PetscInt d = 0; d < dim; ++d) g_t[d] += G[d * n + a] * e_t[a * C];
             }
           }
-          u[q * Nc + fields.uOff[f] + c] = s;
-          u_t[q * Nc + fields.uOff[f] + c] = s_t;
+          u[q * Nc + fields->uOff[f] + c] = s;
+          u_t[q * Nc + fields->uOff[f] + c] = s_t;
           for (PetscInt d = 0; d < dim; ++d) {
-            u_x[q * Nc * dim + fields.uOff_x[f] + c * dim + d] = g[d];
+            u_x[q * Nc * dim + fields->uOff_x[f] + c * dim + d] = g[d];
             if (f == displacement) rate_x[c * dim + d] = g_t[d];
           }
         }
       }
-      make_point_state(u_x + q * Nc * dim + fields.uOff_x[displacement], rate_x, states[q]);
+      make_point_state(u_x + q * Nc * dim + fields->uOff_x[displacement], rate_x, states[q]);
     }
   }
 };
@@ -223,38 +226,36 @@ public:
   Caller(const PointData &d, PetscReal time, PetscReal time_shift, PetscInt n_constants, const PetscScalar *c,
          IntegrationLog *l)
       : data(d), t(time), shift(time_shift), nc(n_constants), constants(c), log(l)
-  {
-  }
+  {}
 
   // out: [point][stride]
   void operator()(PetscPointFunc f, PetscScalar *out, PetscInt stride) const
   {
     const Clock clock(*this, reinterpret_cast<void (*)(void)>(f));
-    for (PetscInt q = 0; q < data.fields.points; ++q)
-      f(dim, data.fields.n, precomputed_state, data.fields.uOff, data.fields.uOff_x, u(q), u_t(q), u_x(q), nullptr,
+    for (PetscInt q = 0; q < data.fields->points; ++q)
+      f(dim, data.fields->n, precomputed_state, data.fields->uOff, data.fields->uOff_x, u(q), u_t(q), u_x(q), nullptr,
         nullptr, state(q), nullptr, nullptr, t, data.x + q * dim, nc, constants, out + q * stride);
   }
   void operator()(PetscPointJac g, PetscScalar *out, PetscInt stride) const
   {
     const Clock clock(*this, reinterpret_cast<void (*)(void)>(g));
-    for (PetscInt q = 0; q < data.fields.points; ++q)
-      g(dim, data.fields.n, precomputed_state, data.fields.uOff, data.fields.uOff_x, u(q), u_t(q), u_x(q), nullptr,
+    for (PetscInt q = 0; q < data.fields->points; ++q)
+      g(dim, data.fields->n, precomputed_state, data.fields->uOff, data.fields->uOff_x, u(q), u_t(q), u_x(q), nullptr,
         nullptr, state(q), nullptr, nullptr, t, shift, data.x + q * dim, nc, constants, out + q * stride);
   }
-  // PetscPointJac and PetscBdPointFunc differ only in meaning of an argument or two, hence the names
-  void surface(PetscBdPointFunc f, PetscScalar *out, PetscInt stride) const
+  void operator()(PetscBdPointFunc f, PetscScalar *out, PetscInt stride) const
   {
     const Clock clock(*this, reinterpret_cast<void (*)(void)>(f));
-    for (PetscInt q = 0; q < data.fields.points; ++q)
-      f(dim, data.fields.n, precomputed_state, data.fields.uOff, data.fields.uOff_x, u(q), u_t(q), u_x(q), nullptr,
+    for (PetscInt q = 0; q < data.fields->points; ++q)
+      f(dim, data.fields->n, precomputed_state, data.fields->uOff, data.fields->uOff_x, u(q), u_t(q), u_x(q), nullptr,
         nullptr, state(q), nullptr, nullptr, t, data.x + q * dim, data.normals + q * dim, nc, constants,
         out + q * stride);
   }
-  void surface(PetscBdPointJac g, PetscScalar *out, PetscInt stride) const
+  void operator()(PetscBdPointJac g, PetscScalar *out, PetscInt stride) const
   {
     const Clock clock(*this, reinterpret_cast<void (*)(void)>(g));
-    for (PetscInt q = 0; q < data.fields.points; ++q)
-      g(dim, data.fields.n, precomputed_state, data.fields.uOff, data.fields.uOff_x, u(q), u_t(q), u_x(q), nullptr,
+    for (PetscInt q = 0; q < data.fields->points; ++q)
+      g(dim, data.fields->n, precomputed_state, data.fields->uOff, data.fields->uOff_x, u(q), u_t(q), u_x(q), nullptr,
         nullptr, state(q), nullptr, nullptr, t, shift, data.x + q * dim, data.normals + q * dim, nc, constants,
         out + q * stride);
   }
@@ -282,9 +283,9 @@ private:
     PetscLogDouble start_ = 0;
   };
 
-  const PetscScalar *u(PetscInt q) const { return data.u + q * data.fields.total_components; }
-  const PetscScalar *u_t(PetscInt q) const { return data.u_t + q * data.fields.total_components; }
-  const PetscScalar *u_x(PetscInt q) const { return data.u_x + q * data.fields.total_components * dim; }
+  const PetscScalar *u(PetscInt q) const { return data.u + q * data.fields->total_components; }
+  const PetscScalar *u_t(PetscInt q) const { return data.u_t + q * data.fields->total_components; }
+  const PetscScalar *u_x(PetscInt q) const { return data.u_x + q * data.fields->total_components * dim; }
   const PetscScalar *state(PetscInt q) const { return reinterpret_cast<const PetscScalar *>(&data.states[q]); }
 
   const PointData &data;
@@ -294,18 +295,41 @@ private:
   IntegrationLog *log;
 };
 
-/// The residual callbacks of one field.
+/// The residual callbacks of one field; F is PetscPointFunc or PetscBdPointFunc.
 template <class F>
 struct ResidualCallbacks {
   PetscInt n0 = 0, n1 = 0;
   F *f0 = nullptr, *f1 = nullptr;
+
+  PetscErrorCode find(PetscWeakForm wf, const PetscFormKey &key, PetscInt field)
+  {
+    PetscFunctionBeginUser;
+    if constexpr (std::is_same_v<F, PetscPointFunc>)
+      PetscCall(PetscWeakFormGetResidual(wf, key.label, key.value, field, key.part, &n0, &f0, &n1, &f1));
+    else
+      PetscCall(PetscWeakFormGetBdResidual(wf, key.label, key.value, field, key.part, &n0, &f0, &n1, &f1));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+  PetscInt count() const { return n0 + n1; }
 };
 
-/// The Jacobian callbacks of one pair of fields.
+/// The Jacobian callbacks of one pair of fields; G is PetscPointJac or PetscBdPointJac.
 template <class G>
 struct JacobianCallbacks {
   PetscInt n0 = 0, n1 = 0, n2 = 0, n3 = 0;
   G *g0 = nullptr, *g1 = nullptr, *g2 = nullptr, *g3 = nullptr;
+
+  PetscErrorCode find(PetscWeakForm wf, const PetscFormKey &k, PetscInt test, PetscInt trial)
+  {
+    PetscFunctionBeginUser;
+    if constexpr (std::is_same_v<G, PetscPointJac>)
+      PetscCall(
+          PetscWeakFormGetJacobian(wf, k.label, k.value, test, trial, k.part, &n0, &g0, &n1, &g1, &n2, &g2, &n3, &g3));
+    else
+      PetscCall(PetscWeakFormGetBdJacobian(wf, k.label, k.value, test, trial, k.part, &n0, &g0, &n1, &g1, &n2, &g2, &n3,
+                                           &g3));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
   PetscInt count() const { return n0 + n1 + n2 + n3; }
 };
 
@@ -313,12 +337,12 @@ struct JacobianCallbacks {
 void add_to_vector(const PointData &data, PetscInt field, const PetscScalar *f0, const PetscScalar *f1,
                    PetscScalar *vector)
 {
-  const ScalarBasis &basis = data.fields.basis[field];
+  const ScalarBasis &basis = data.fields->basis[field];
   const PetscInt C = basis.components, n = basis.stride;
   alignas(64) PetscScalar sum[64];
   for (PetscInt c = 0; c < C; ++c) {
     for (PetscInt a = 0; a < n; ++a) sum[a] = 0;
-    for (PetscInt q = 0; q < data.fields.points; ++q) {
+    for (PetscInt q = 0; q < data.fields->points; ++q) {
       const PetscScalar w = data.weights[q], *B = basis.values + q * n, *G = data.gradients[field] + q * dim * n;
       if (f0) {
         const PetscScalar s = w * f0[q * C + c];
@@ -350,17 +374,17 @@ struct MatrixBuilder {
   MatrixBuilder(const PointData &d, Scratch &scratch) : data(d)
   {
     std::size_t widest = 0;
-    for (PetscInt i = 0; i < d.fields.n; ++i) widest = std::max(widest, Scratch::padded(d.fields.basis[i].stride));
-    left = scratch.take(d.fields.points * rows_per_point * widest);
-    right = scratch.take(d.fields.points * rows_per_point * widest);
+    for (PetscInt i = 0; i < d.fields->n; ++i) widest = std::max(widest, Scratch::padded(d.fields->basis[i].stride));
+    left = scratch.take(d.fields->points * rows_per_point * widest);
+    right = scratch.take(d.fields->points * rows_per_point * widest);
     block = scratch.take(widest * widest);
   }
 
   void add(PetscInt test, PetscInt trial, const PetscScalar *g0, const PetscScalar *g1, const PetscScalar *g2,
            const PetscScalar *g3, PetscScalar *matrix) const
   {
-    const ScalarBasis &bi = data.fields.basis[test], &bj = data.fields.basis[trial];
-    const PetscInt Ci = bi.components, Cj = bj.components, ni = bi.stride, nj = bj.stride, Nq = data.fields.points;
+    const ScalarBasis &bi = data.fields->basis[test], &bj = data.fields->basis[trial];
+    const PetscInt Ci = bi.components, Cj = bj.components, ni = bi.stride, nj = bj.stride, Nq = data.fields->points;
     const bool by_gradient = g2 || g3, by_value = g0 || g1; // of the test function
     const PetscInt per_point = dim * by_gradient + by_value, rank = Nq * per_point;
 
@@ -406,7 +430,7 @@ struct MatrixBuilder {
         for (PetscInt i = 0; i < bi.nodes * nj; ++i) block[i] = 0;
         product(bi.nodes, rank, left, ni, right, nj, block);
         for (PetscInt a = 0; a < bi.nodes; ++a) {
-          PetscScalar *row = matrix + (bi.offset + a * Ci + c) * data.fields.element_size + bj.offset + e;
+          PetscScalar *row = matrix + (bi.offset + a * Ci + c) * data.fields->element_size + bj.offset + e;
           for (PetscInt b = 0; b < bj.nodes; ++b) row[b * Cj] += block[a * nj + b];
         }
       }
@@ -414,76 +438,105 @@ struct MatrixBuilder {
   }
 };
 
-/// Material coordinates of the points of cell @p e.
-void cell_points(const PetscFEGeom *geom, PetscInt e, PetscInt Nq, const PetscReal *reference, PetscReal *x)
-{
-  const PetscReal *v = geom->v + e * geom->numPoints * dim, *J = geom->J + e * geom->numPoints * dim * dim;
-  const PetscReal corner[3] = {-1, -1, -1}, *origin = geom->xi ? geom->xi : corner;
-  for (PetscInt q = 0; q < Nq; ++q)
-    for (PetscInt i = 0; i < dim; ++i) {
-      x[q * dim + i] = v[i];
-      for (PetscInt d = 0; d < dim; ++d) x[q * dim + i] += J[i * dim + d] * (reference[q * dim + d] - origin[d]);
-    }
-}
+// -------------------------------------------------------------------------------------------- cells and facets
 
-PetscErrorCode check_geometry(const PetscFEGeom *geom)
-{
-  PetscFunctionBeginUser;
-  PetscCheck(geom->isAffine && geom->dimEmbed == dim, PETSC_COMM_SELF, PETSC_ERR_SUP,
-             "PetscFE type pulmo integrates over straight-sided tetrahedra only");
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
+/// The cells or facets of one call: their tabulations, rule, constants and geometry.
+class Places {
+public:
+  Places(PetscDS ds, const PetscFEGeom *geom, bool facets) : ds_(ds), geom_(geom), facets_(facets) {}
 
-// -------------------------------------------------------------------------------------------- the PetscFE type
+  PetscErrorCode setup()
+  {
+    PetscFE fe;
+    PetscQuadrature rule;
+    PetscTabulation *T;
+    PetscInt n_fields;
 
-PetscErrorCode integrate_residual(PetscDS ds, PetscFormKey key, PetscInt Ne, PetscFEGeom *geom,
-                                  const PetscScalar coefficients[], const PetscScalar coefficients_t[], PetscDS,
-                                  const PetscScalar[], PetscReal t, PetscScalar vectors[])
-{
-  PetscTabulation *T;
-  PetscQuadrature rule;
-  PetscFE fe;
-  PetscWeakForm wf;
-  PetscInt Nf, Nq, nc, n_calls = 0;
-  const PetscReal *reference, *weights;
-  const PetscScalar *constants;
-  IntegrationLog *log;
-
-  PetscFunctionBeginUser;
-  if (key.field != 0 || Ne == 0) PetscFunctionReturn(PETSC_SUCCESS);
-  PetscCall(check_geometry(geom));
-  PetscCall(PetscDSGetNumFields(ds, &Nf));
-  PetscCall(PetscDSGetTabulation(ds, &T));
-  PetscCall(PetscDSGetDiscretization(ds, 0, (PetscObject *)&fe));
-  PetscCall(PetscFEGetQuadrature(fe, &rule));
-  PetscCall(PetscQuadratureGetData(rule, nullptr, nullptr, &Nq, &reference, &weights));
-  PetscCall(PetscDSGetConstants(ds, &nc, &constants));
-  PetscCall(PetscDSGetWeakForm(ds, &wf));
-  PetscCall(IntegrationLog::find(ds, &log));
-
-  ResidualCallbacks<PetscPointFunc> callbacks[max_fields];
-  for (PetscInt f = 0; f < Nf; ++f) {
-    auto &c = callbacks[f];
-    PetscCall(PetscWeakFormGetResidual(wf, key.label, key.value, f, key.part, &c.n0, &c.f0, &c.n1, &c.f1));
-    n_calls += c.n0 + c.n1;
+    PetscFunctionBeginUser;
+    PetscCheck(geom_->isAffine && geom_->dimEmbed == dim, PETSC_COMM_SELF, PETSC_ERR_SUP,
+               "PetscFE type pulmo integrates over straight-sided tetrahedra only");
+    PetscCall(PetscDSGetNumFields(ds_, &n_fields));
+    PetscCall(PetscDSGetDiscretization(ds_, 0, (PetscObject *)&fe));
+    PetscCall(facets_ ? PetscFEGetFaceQuadrature(fe, &rule) : PetscFEGetQuadrature(fe, &rule));
+    PetscCall(PetscQuadratureGetData(rule, nullptr, nullptr, nullptr, &reference_, &weights_));
+    PetscCall(facets_ ? PetscDSGetFaceTabulation(ds_, &T) : PetscDSGetTabulation(ds_, &T));
+    PetscCall(PetscDSGetConstants(ds_, &n_constants, &constants));
+    PetscCall(IntegrationLog::find(ds_, &log));
+    const PetscInt replicas = facets_ ? 4 : 1; // the faces of the reference cell
+    tables_.emplace(replicas * fields_scratch(n_fields, T, 1));
+    for (PetscInt i = 0; i < replicas; ++i) PetscCall(make_fields(ds_, T, i, *tables_, fields_[i]));
+    PetscFunctionReturn(PETSC_SUCCESS);
   }
-  Scratch tables(fields_scratch(Nf, T, 1));
-  Fields fields;
-  PetscCall(make_fields(ds, T, 0, tables, fields));
+
+  const Fields &fields() const { return fields_[0]; }
+
+  /// Fills @p data for place @p e.
+  void visit(PetscInt e, const PetscScalar *coefficients, const PetscScalar *coefficients_t, PointData &data) const
+  {
+    const PetscInt stride = geom_->numPoints, size = fields().element_size, manifold = facets_ ? dim - 1 : dim;
+    const PetscReal *inverse = (facets_ ? geom_->suppInvJ[0] : geom_->invJ) + e * stride * dim * dim;
+    const PetscReal *v = geom_->v + e * stride * dim, *J = geom_->J + e * stride * dim * dim;
+    static const PetscReal corner[3] = {-1, -1, -1};
+    const PetscReal *origin = geom_->xi ? geom_->xi : corner;
+
+    data.fields = &fields_[facets_ ? geom_->face[e][0] : 0];
+    data.evaluate(inverse, coefficients + e * size, coefficients_t ? coefficients_t + e * size : nullptr);
+    for (PetscInt q = 0; q < data.fields->points; ++q) {
+      data.weights[q] = weights_[q] * geom_->detJ[e * stride];
+      for (PetscInt i = 0; i < dim; ++i) {
+        data.x[q * dim + i] = v[i];
+        for (PetscInt d = 0; d < manifold; ++d)
+          data.x[q * dim + i] += J[i * dim + d] * (reference_[q * manifold + d] - origin[d]);
+        if (facets_) data.normals[q * dim + i] = geom_->n[e * stride * dim + i];
+      }
+    }
+  }
+
+  PetscInt n_constants = 0;
+  const PetscScalar *constants = nullptr;
+  IntegrationLog *log = nullptr;
+
+private:
+  PetscDS ds_;
+  const PetscFEGeom *geom_;
+  bool facets_;
+  const PetscReal *reference_ = nullptr, *weights_ = nullptr;
+  std::optional<Scratch> tables_;
+  Fields fields_[4];
+};
+
+/// Residual of fields @p first ... @p last - 1 at all places; F is PetscPointFunc or PetscBdPointFunc.
+template <class F>
+PetscErrorCode integrate_vectors(PetscDS ds, PetscWeakForm wf, const PetscFormKey &key, PetscInt first, PetscInt last,
+                                 PetscInt Ne, const PetscFEGeom *geom, const PetscScalar coefficients[],
+                                 const PetscScalar coefficients_t[], PetscReal t, PetscScalar vectors[],
+                                 PetscInt *n_calls)
+{
+  ResidualCallbacks<F> callbacks[max_fields];
+  Places places(ds, geom, std::is_same_v<F, PetscBdPointFunc>);
+
+  PetscFunctionBeginUser;
+  *n_calls = 0;
+  for (PetscInt f = first; f < last; ++f) {
+    PetscCall(callbacks[f].find(wf, key, f));
+    *n_calls += callbacks[f].count();
+  }
+  if (*n_calls == 0) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(places.setup());
+  const Fields &fields = places.fields();
+  const PetscInt Nq = fields.points;
   Scratch work(PointData::scratch_size(fields) + 2 * Scratch::padded(Nq * 9));
   PointData data(fields, work);
   PetscScalar *f0 = work.take(Nq * 3), *f1 = work.take(Nq * 9);
-  const Caller call(data, t, 0, nc, constants, log);
+  const Caller call(data, t, 0, places.n_constants, places.constants, places.log);
 
+  *n_calls *= Nq * Ne;
   for (PetscInt e = 0; e < Ne; ++e) {
-    const PetscScalar *u_t = coefficients_t ? coefficients_t + e * fields.element_size : nullptr;
-    data.evaluate(geom->invJ + e * geom->numPoints * dim * dim, coefficients + e * fields.element_size, u_t);
-    cell_points(geom, e, Nq, reference, data.x);
-    for (PetscInt q = 0; q < Nq; ++q) data.weights[q] = weights[q] * geom->detJ[e * geom->numPoints];
-    for (PetscInt f = 0; f < Nf; ++f) {
+    places.visit(e, coefficients, coefficients_t, data);
+    for (PetscInt f = first; f < last; ++f) {
       const auto &c = callbacks[f];
       const PetscInt C = fields.basis[f].components;
-      if (c.n0 + c.n1 == 0) continue;
+      if (c.count() == 0) continue;
       PetscCall(PetscArrayzero(f0, Nq * C));
       PetscCall(PetscArrayzero(f1, Nq * C * dim));
       for (PetscInt i = 0; i < c.n0; ++i) call(c.f0[i], f0, C);
@@ -491,209 +544,146 @@ PetscErrorCode integrate_residual(PetscDS ds, PetscFormKey key, PetscInt Ne, Pet
       add_to_vector(data, f, c.n0 ? f0 : nullptr, c.n1 ? f1 : nullptr, vectors + e * fields.element_size);
     }
   }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Jacobian blocks of field pairs @p first ... @p last - 1 (pair = test * fields + trial) at all places;
+/// G is PetscPointJac or PetscBdPointJac.
+template <class G>
+PetscErrorCode integrate_matrices(PetscDS ds, PetscWeakForm wf, const PetscFormKey &key, PetscInt first, PetscInt last,
+                                  PetscInt Ne, const PetscFEGeom *geom, const PetscScalar coefficients[],
+                                  const PetscScalar coefficients_t[], PetscReal t, PetscReal shift,
+                                  PetscScalar matrices[], PetscInt *n_calls)
+{
+  JacobianCallbacks<G> callbacks[max_fields * max_fields];
+  Places places(ds, geom, std::is_same_v<G, PetscBdPointJac>);
+  PetscInt Nf;
+
+  PetscFunctionBeginUser;
+  *n_calls = 0;
+  PetscCall(PetscDSGetNumFields(ds, &Nf));
+  PetscCheck(Nf <= max_fields, PETSC_COMM_SELF, PETSC_ERR_SUP, "more than %d fields", (int)max_fields);
+  for (PetscInt pair = first; pair < last; ++pair) {
+    PetscCall(callbacks[pair].find(wf, key, pair / Nf, pair % Nf));
+    *n_calls += callbacks[pair].count();
+  }
+  if (*n_calls == 0) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(places.setup());
+  const Fields &fields = places.fields();
+  const PetscInt Nq = fields.points;
+  Scratch work(PointData::scratch_size(fields) + MatrixBuilder::scratch_size(fields) + 4 * Scratch::padded(Nq * 81));
+  PointData data(fields, work);
+  const MatrixBuilder builder(data, work);
+  PetscScalar *g0 = work.take(Nq * 9), *g1 = work.take(Nq * 27), *g2 = work.take(Nq * 27), *g3 = work.take(Nq * 81);
+  const Caller call(data, t, shift, places.n_constants, places.constants, places.log);
+
+  *n_calls *= Nq * Ne;
+  for (PetscInt e = 0; e < Ne; ++e) {
+    places.visit(e, coefficients, coefficients_t, data);
+    for (PetscInt pair = first; pair < last; ++pair) {
+      const auto &c = callbacks[pair];
+      const PetscInt test = pair / Nf, trial = pair % Nf;
+      const PetscInt entries = fields.basis[test].components * fields.basis[trial].components;
+      if (c.count() == 0) continue;
+      if (c.n0) PetscCall(PetscArrayzero(g0, Nq * entries));
+      if (c.n1) PetscCall(PetscArrayzero(g1, Nq * entries * dim));
+      if (c.n2) PetscCall(PetscArrayzero(g2, Nq * entries * dim));
+      if (c.n3) PetscCall(PetscArrayzero(g3, Nq * entries * dim * dim));
+      for (PetscInt i = 0; i < c.n0; ++i) call(c.g0[i], g0, entries);
+      for (PetscInt i = 0; i < c.n1; ++i) call(c.g1[i], g1, entries * dim);
+      for (PetscInt i = 0; i < c.n2; ++i) call(c.g2[i], g2, entries * dim);
+      for (PetscInt i = 0; i < c.n3; ++i) call(c.g3[i], g3, entries * dim * dim);
+      builder.add(test, trial, c.n0 ? g0 : nullptr, c.n1 ? g1 : nullptr, c.n2 ? g2 : nullptr, c.n3 ? g3 : nullptr,
+                  matrices + e * fields.element_size * fields.element_size);
+    }
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+// -------------------------------------------------------------------------------------------- the PetscFE type
+
+PetscErrorCode integrate_residual(PetscDS ds, PetscFormKey key, PetscInt Ne, PetscFEGeom *geom, const PetscScalar u[],
+                                  const PetscScalar u_t[], PetscDS, const PetscScalar[], PetscReal t,
+                                  PetscScalar vectors[])
+{
+  PetscWeakForm wf;
+  PetscInt Nf, n_calls;
+  IntegrationLog *log;
+
+  PetscFunctionBeginUser;
+  if (key.field != 0 || Ne == 0) PetscFunctionReturn(PETSC_SUCCESS); // all fields are done with the first
+  PetscCall(PetscDSGetNumFields(ds, &Nf));
+  PetscCall(PetscDSGetWeakForm(ds, &wf));
+  PetscCall(integrate_vectors<PetscPointFunc>(ds, wf, key, 0, Nf, Ne, geom, u, u_t, t, vectors, &n_calls));
+  PetscCall(IntegrationLog::find(ds, &log));
   if (log) {
-    log->residual_calls += n_calls * Ne * Nq;
+    log->residual_calls += n_calls;
     log->residual_cells += Ne;
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
 PetscErrorCode integrate_jacobian(PetscDS ds, PetscFEJacobianType type, PetscFormKey key, PetscInt Ne,
-                                  PetscFEGeom *geom, const PetscScalar coefficients[],
-                                  const PetscScalar coefficients_t[], PetscDS, const PetscScalar[], PetscReal t,
-                                  PetscReal shift, PetscScalar matrices[])
+                                  PetscFEGeom *geom, const PetscScalar u[], const PetscScalar u_t[], PetscDS,
+                                  const PetscScalar[], PetscReal t, PetscReal shift, PetscScalar matrices[])
 {
-  PetscTabulation *T;
-  PetscQuadrature rule;
-  PetscFE fe;
   PetscWeakForm wf;
-  PetscInt Nf, Nq, nc, n_calls = 0;
-  const PetscReal *reference, *weights;
-  const PetscScalar *constants;
+  PetscInt Nf, n_calls;
   IntegrationLog *log;
 
   PetscFunctionBeginUser;
   if (key.field != 0 || Ne == 0 || type == PETSCFE_JACOBIAN_DYN) PetscFunctionReturn(PETSC_SUCCESS);
-  PetscCall(check_geometry(geom));
   PetscCall(PetscDSGetNumFields(ds, &Nf));
-  PetscCall(PetscDSGetTabulation(ds, &T));
-  PetscCall(PetscDSGetDiscretization(ds, 0, (PetscObject *)&fe));
-  PetscCall(PetscFEGetQuadrature(fe, &rule));
-  PetscCall(PetscQuadratureGetData(rule, nullptr, nullptr, &Nq, &reference, &weights));
-  PetscCall(PetscDSGetConstants(ds, &nc, &constants));
   PetscCall(PetscDSGetWeakForm(ds, &wf));
+  PetscCall(integrate_matrices<PetscPointJac>(ds, wf, key, 0, Nf * Nf, Ne, geom, u, u_t, t, shift, matrices, &n_calls));
   PetscCall(IntegrationLog::find(ds, &log));
-
-  JacobianCallbacks<PetscPointJac> callbacks[max_fields][max_fields];
-  for (PetscInt f = 0; f < Nf; ++f)
-    for (PetscInt g = 0; g < Nf; ++g) {
-      auto &c = callbacks[f][g];
-      PetscCall(PetscWeakFormGetJacobian(wf, key.label, key.value, f, g, key.part, &c.n0, &c.g0, &c.n1, &c.g1, &c.n2,
-                                         &c.g2, &c.n3, &c.g3));
-      n_calls += c.count();
-    }
-  Scratch tables(fields_scratch(Nf, T, 1));
-  Fields fields;
-  PetscCall(make_fields(ds, T, 0, tables, fields));
-  Scratch work(PointData::scratch_size(fields) + MatrixBuilder::scratch_size(fields) + 4 * Scratch::padded(Nq * 81));
-  PointData data(fields, work);
-  const MatrixBuilder builder(data, work);
-  PetscScalar *g0 = work.take(Nq * 9), *g1 = work.take(Nq * 27), *g2 = work.take(Nq * 27), *g3 = work.take(Nq * 81);
-  const Caller call(data, t, shift, nc, constants, log);
-
-  for (PetscInt e = 0; e < Ne; ++e) {
-    const PetscScalar *u_t = coefficients_t ? coefficients_t + e * fields.element_size : nullptr;
-    data.evaluate(geom->invJ + e * geom->numPoints * dim * dim, coefficients + e * fields.element_size, u_t);
-    cell_points(geom, e, Nq, reference, data.x);
-    for (PetscInt q = 0; q < Nq; ++q) data.weights[q] = weights[q] * geom->detJ[e * geom->numPoints];
-    for (PetscInt f = 0; f < Nf; ++f)
-      for (PetscInt g = 0; g < Nf; ++g) {
-        const auto &c = callbacks[f][g];
-        const PetscInt pairs = fields.basis[f].components * fields.basis[g].components;
-        if (c.count() == 0) continue;
-        if (c.n0) PetscCall(PetscArrayzero(g0, Nq * pairs));
-        if (c.n1) PetscCall(PetscArrayzero(g1, Nq * pairs * dim));
-        if (c.n2) PetscCall(PetscArrayzero(g2, Nq * pairs * dim));
-        if (c.n3) PetscCall(PetscArrayzero(g3, Nq * pairs * dim * dim));
-        for (PetscInt i = 0; i < c.n0; ++i) call(c.g0[i], g0, pairs);
-        for (PetscInt i = 0; i < c.n1; ++i) call(c.g1[i], g1, pairs * dim);
-        for (PetscInt i = 0; i < c.n2; ++i) call(c.g2[i], g2, pairs * dim);
-        for (PetscInt i = 0; i < c.n3; ++i) call(c.g3[i], g3, pairs * dim * dim);
-        builder.add(f, g, c.n0 ? g0 : nullptr, c.n1 ? g1 : nullptr, c.n2 ? g2 : nullptr, c.n3 ? g3 : nullptr,
-                    matrices + e * fields.element_size * fields.element_size);
-      }
-  }
   if (log) {
-    log->jacobian_calls += n_calls * Ne * Nq;
+    log->jacobian_calls += n_calls;
     log->jacobian_cells += Ne;
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-/// What the points of a face need: weights, normals and coordinates.
-void face_points(const PetscFEGeom *geom, PetscInt e, const PetscReal *weights, PointData &data)
-{
-  for (PetscInt q = 0; q < data.fields.points; ++q) {
-    data.weights[q] = weights[q] * geom->detJ[e * geom->numPoints];
-    for (PetscInt d = 0; d < dim; ++d) {
-      data.normals[q * dim + d] = geom->n[e * geom->numPoints * dim + d];
-      data.x[q * dim + d] = 0;
-    }
-  }
-}
-
-/// Material coordinates of the points of face @p e, by the affine map of the face that @p geom holds.
-void face_coordinates(const PetscFEGeom *geom, PetscInt e, PetscInt Nq, const PetscReal *reference, PetscReal *x)
-{
-  const PetscReal *v = geom->v + e * geom->numPoints * dim, *J = geom->J + e * geom->numPoints * dim * dim;
-  const PetscReal corner[2] = {-1, -1}, *origin = geom->xi ? geom->xi : corner;
-  for (PetscInt q = 0; q < Nq; ++q)
-    for (PetscInt i = 0; i < dim; ++i) {
-      x[q * dim + i] = v[i];
-      for (PetscInt d = 0; d < dim - 1; ++d)
-        x[q * dim + i] += J[i * dim + d] * (reference[q * (dim - 1) + d] - origin[d]);
-    }
-}
-
 PetscErrorCode integrate_surface_residual(PetscDS ds, PetscWeakForm wf, PetscFormKey key, PetscInt Ne,
-                                          PetscFEGeom *geom, const PetscScalar coefficients[],
-                                          const PetscScalar coefficients_t[], PetscDS, const PetscScalar[],
-                                          PetscReal t, PetscScalar vectors[])
+                                          PetscFEGeom *geom, const PetscScalar u[], const PetscScalar u_t[], PetscDS,
+                                          const PetscScalar[], PetscReal t, PetscScalar vectors[])
 {
-  PetscTabulation *T;
-  PetscQuadrature rule;
-  PetscFE fe;
-  PetscInt Nf, Nq, nc;
-  const PetscReal *reference, *weights;
-  const PetscScalar *constants;
-  IntegrationLog *log;
-  ResidualCallbacks<PetscBdPointFunc> c;
+  PetscInt n_calls;
 
   PetscFunctionBeginUser;
-  PetscCall(PetscWeakFormGetBdResidual(wf, key.label, key.value, key.field, key.part, &c.n0, &c.f0, &c.n1, &c.f1));
-  if (c.n0 + c.n1 == 0 || Ne == 0) PetscFunctionReturn(PETSC_SUCCESS);
-  PetscCall(check_geometry(geom));
-  PetscCall(PetscDSGetNumFields(ds, &Nf));
-  PetscCall(PetscDSGetFaceTabulation(ds, &T));
-  PetscCall(PetscDSGetDiscretization(ds, 0, (PetscObject *)&fe));
-  PetscCall(PetscFEGetFaceQuadrature(fe, &rule));
-  PetscCall(PetscQuadratureGetData(rule, nullptr, nullptr, &Nq, &reference, &weights));
-  PetscCall(PetscDSGetConstants(ds, &nc, &constants));
-  PetscCall(IntegrationLog::find(ds, &log));
-
-  Scratch tables(4 * fields_scratch(Nf, T, 1));
-  Fields faces[4];
-  for (PetscInt i = 0; i < 4; ++i) PetscCall(make_fields(ds, T, i, tables, faces[i]));
-  const PetscInt size = faces[0].element_size, C = faces[0].basis[key.field].components;
-  for (PetscInt e = 0; e < Ne; ++e) {
-    Scratch work(PointData::scratch_size(faces[0]) + 2 * Scratch::padded(Nq * 9));
-    PointData data(faces[geom->face[e][0]], work);
-    PetscScalar *f0 = work.take(Nq * C), *f1 = work.take(Nq * C * dim);
-    const Caller call(data, t, 0, nc, constants, log);
-    data.evaluate(geom->suppInvJ[0] + e * geom->numPoints * dim * dim, coefficients + e * size,
-                  coefficients_t ? coefficients_t + e * size : nullptr);
-    face_points(geom, e, weights, data);
-    face_coordinates(geom, e, Nq, reference, data.x);
-    for (PetscInt i = 0; i < c.n0; ++i) call.surface(c.f0[i], f0, C);
-    for (PetscInt i = 0; i < c.n1; ++i) call.surface(c.f1[i], f1, C * dim);
-    add_to_vector(data, key.field, c.n0 ? f0 : nullptr, c.n1 ? f1 : nullptr, vectors + e * size);
-  }
+  PetscCall(integrate_vectors<PetscBdPointFunc>(ds, wf, key, key.field, key.field + 1, Ne, geom, u, u_t, t, vectors,
+                                                &n_calls));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
 PetscErrorCode integrate_surface_jacobian(PetscDS ds, PetscWeakForm wf, PetscFormKey key, PetscInt Ne,
-                                          PetscFEGeom *geom, const PetscScalar coefficients[],
-                                          const PetscScalar coefficients_t[], PetscDS, const PetscScalar[],
-                                          PetscReal t, PetscReal shift, PetscScalar matrices[])
+                                          PetscFEGeom *geom, const PetscScalar u[], const PetscScalar u_t[], PetscDS,
+                                          const PetscScalar[], PetscReal t, PetscReal shift, PetscScalar matrices[])
 {
-  PetscTabulation *T;
-  PetscQuadrature rule;
-  PetscFE fe;
-  PetscInt Nf, Nq, nc;
-  const PetscReal *reference, *weights;
-  const PetscScalar *constants;
-  IntegrationLog *log;
-  JacobianCallbacks<PetscBdPointJac> c;
+  PetscInt n_calls;
 
   PetscFunctionBeginUser;
-  PetscCall(PetscDSGetNumFields(ds, &Nf));
-  const PetscInt test = key.field / Nf, trial = key.field % Nf;
-  PetscCall(PetscWeakFormGetBdJacobian(wf, key.label, key.value, test, trial, key.part, &c.n0, &c.g0, &c.n1, &c.g1,
-                                       &c.n2, &c.g2, &c.n3, &c.g3));
-  if (c.count() == 0 || Ne == 0) PetscFunctionReturn(PETSC_SUCCESS);
-  PetscCall(check_geometry(geom));
-  PetscCall(PetscDSGetFaceTabulation(ds, &T));
-  PetscCall(PetscDSGetDiscretization(ds, 0, (PetscObject *)&fe));
-  PetscCall(PetscFEGetFaceQuadrature(fe, &rule));
-  PetscCall(PetscQuadratureGetData(rule, nullptr, nullptr, &Nq, &reference, &weights));
-  PetscCall(PetscDSGetConstants(ds, &nc, &constants));
-  PetscCall(IntegrationLog::find(ds, &log));
-
-  Scratch tables(4 * fields_scratch(Nf, T, 1));
-  Fields faces[4];
-  for (PetscInt i = 0; i < 4; ++i) PetscCall(make_fields(ds, T, i, tables, faces[i]));
-  const PetscInt size = faces[0].element_size,
-                 pairs = faces[0].basis[test].components * faces[0].basis[trial].components;
-  for (PetscInt e = 0; e < Ne; ++e) {
-    const Fields &fields = faces[geom->face[e][0]];
-    Scratch work(PointData::scratch_size(fields) + MatrixBuilder::scratch_size(fields) + 4 * Scratch::padded(Nq * 81));
-    PointData data(fields, work);
-    const MatrixBuilder builder(data, work);
-    PetscScalar *g0 = work.take(Nq * pairs), *g1 = work.take(Nq * pairs * dim), *g2 = work.take(Nq * pairs * dim),
-                *g3 = work.take(Nq * pairs * dim * dim);
-    const Caller call(data, t, shift, nc, constants, log);
-    data.evaluate(geom->suppInvJ[0] + e * geom->numPoints * dim * dim, coefficients + e * size,
-                  coefficients_t ? coefficients_t + e * size : nullptr);
-    face_points(geom, e, weights, data);
-    face_coordinates(geom, e, Nq, reference, data.x);
-    for (PetscInt i = 0; i < c.n0; ++i) call.surface(c.g0[i], g0, pairs);
-    for (PetscInt i = 0; i < c.n1; ++i) call.surface(c.g1[i], g1, pairs * dim);
-    for (PetscInt i = 0; i < c.n2; ++i) call.surface(c.g2[i], g2, pairs * dim);
-    for (PetscInt i = 0; i < c.n3; ++i) call.surface(c.g3[i], g3, pairs * dim * dim);
-    builder.add(test, trial, c.n0 ? g0 : nullptr, c.n1 ? g1 : nullptr, c.n2 ? g2 : nullptr, c.n3 ? g3 : nullptr,
-                matrices + e * size * size);
-  }
+  PetscCall(integrate_matrices<PetscBdPointJac>(ds, wf, key, key.field, key.field + 1, Ne, geom, u, u_t, t, shift,
+                                                matrices, &n_calls));
   PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+// The same with the arguments of newer releases of PETSc: assigning to fe->ops takes the overload that fits.
+[[maybe_unused]] PetscErrorCode integrate_jacobian(PetscDS ds, PetscDS, PetscFEJacobianType type, PetscFormKey key,
+                                                   PetscInt Ne, PetscFEGeom *geom, const PetscScalar u[],
+                                                   const PetscScalar u_t[], PetscDS aux, const PetscScalar a[],
+                                                   PetscReal t, PetscReal shift, PetscScalar matrices[])
+{
+  return integrate_jacobian(ds, type, key, Ne, geom, u, u_t, aux, a, t, shift, matrices);
+}
+
+[[maybe_unused]] PetscErrorCode integrate_surface_jacobian(PetscDS ds, PetscWeakForm wf, PetscFEJacobianType,
+                                                           PetscFormKey key, PetscInt Ne, PetscFEGeom *geom,
+                                                           const PetscScalar u[], const PetscScalar u_t[], PetscDS aux,
+                                                           const PetscScalar a[], PetscReal t, PetscReal shift,
+                                                           PetscScalar matrices[])
+{
+  return integrate_surface_jacobian(ds, wf, key, Ne, geom, u, u_t, aux, a, t, shift, matrices);
 }
 
 PetscErrorCode create_fe(PetscFE fe)

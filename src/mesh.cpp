@@ -96,8 +96,8 @@ PetscErrorCode Mesh::read(const Options &options, bool ventilated)
   PetscCall(DMSetFromOptions(dm_));
   PetscCall(DMViewFromOptions(dm_, nullptr, "-dm_view"));
   PetscCall(DMGetDimension(dm_, &dim));
-  PulmoUserCheck(dim == 3, comm, "-dm_plex_filename %s holds no volume elements (dimension %d); mesh the volume",
-                 name, static_cast<int>(dim));
+  PulmoUserCheck(dim == 3, comm, "-dm_plex_filename %s holds no volume elements (dimension %d); mesh the volume", name,
+                 static_cast<int>(dim));
   PetscCall(DMGetCoordinatesLocal(dm_, &coordinates));
   PetscCall(VecScale(coordinates, scale_));
   PetscCall(DMGetCoordinates(dm_, &coordinates));
@@ -107,10 +107,12 @@ PetscErrorCode Mesh::read(const Options &options, bool ventilated)
   if (ventilated && !scale_given_) {
     PulmoUserCheck(volume_ >= least_lung, comm,
                    "the mesh %s holds %.3g ml, as if its coordinates were in metres: give -mesh_scale 1000 "
-                   "(or -mesh_scale 1 if that is the size)", name, (double)(volume_ / units::mm3_per_ml));
+                   "(or -mesh_scale 1 if that is the size)",
+                   name, (double)(volume_ / units::mm3_per_ml));
     PulmoUserCheck(volume_ <= largest_lung, comm,
                    "the mesh %s holds %.3g ml, as if its coordinates were in micrometres: give -mesh_scale 0.001 "
-                   "(or -mesh_scale 1 if that is the size)", name, (double)(volume_ / units::mm3_per_ml));
+                   "(or -mesh_scale 1 if that is the size)",
+                   name, (double)(volume_ / units::mm3_per_ml));
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -143,12 +145,13 @@ PetscErrorCode Mesh::check_cells(const Options &options)
     PetscCall(cell_corners(dm_, c, x));
     for (int i = 0; i < 4; ++i)
       for (int j = 0; j < i; ++j)
-        longest = std::max(longest, std::hypot(x[3 * i] - x[3 * j], x[3 * i + 1] - x[3 * j + 1], x[3 * i + 2] - x[3 * j + 2]));
+        longest = std::max(longest,
+                           std::hypot(x[3 * i] - x[3 * j], x[3 * i + 1] - x[3 * j + 1], x[3 * i + 2] - x[3 * j + 2]));
     for (int i = 0; i < 3; ++i)
       for (int d = 0; d < 3; ++d) J[3 * i + d] = x[3 * (i + 1) + d] - x[d];
     // DMPlex numbers the corners of a tetrahedron so that this determinant is negative for a good cell
-    const PetscReal det = -(J[0] * (J[4] * J[8] - J[5] * J[7]) + J[1] * (J[5] * J[6] - J[3] * J[8]) +
-                            J[2] * (J[3] * J[7] - J[4] * J[6]));
+    const PetscReal det =
+        -(J[0] * (J[4] * J[8] - J[5] * J[7]) + J[1] * (J[5] * J[6] - J[3] * J[8]) + J[2] * (J[3] * J[7] - J[4] * J[6]));
     const PetscReal share = longest > 0 ? det / (longest * longest * longest) : 0;
     volume += det / 6;
     if (!(share > degenerate)) ++bad;
@@ -165,7 +168,8 @@ PetscErrorCode Mesh::check_cells(const Options &options)
   cells_ = counts[0];
   volume_ = volume;
   PulmoUserCheck(cells_ > 0, comm, "-dm_plex_filename %s holds no cells", file_.c_str());
-  PulmoUserCheck(counts[2] == 0, comm, "-dm_plex_filename %s holds %d cells that are not tetrahedra; mesh with tetrahedra only",
+  PulmoUserCheck(counts[2] == 0, comm,
+                 "-dm_plex_filename %s holds %d cells that are not tetrahedra; mesh with tetrahedra only",
                  file_.c_str(), static_cast<int>(counts[2]));
   PulmoUserCheck(counts[1] == 0, comm,
                  "-dm_plex_filename %s holds %d inverted or degenerate cells, the worst at (%.6g, %.6g, %.6g) mm with "
@@ -215,8 +219,10 @@ PetscErrorCode Mesh::find_surfaces(const Options &options)
         PetscCall(DMPlexGetSupportSize(dm_, points[i], &support));
         PetscCall(DMPlexComputeCellGeometryFVM(dm_, points[i], &a, nullptr, nullptr));
         ++faces;
-        if (support > 1) ++interior;
-        else area += a;
+        if (support > 1)
+          ++interior;
+        else
+          area += a;
       }
       PetscCall(ISRestoreIndices(points_is, &points));
     }
@@ -227,7 +233,8 @@ PetscErrorCode Mesh::find_surfaces(const Options &options)
     if (found[0] > 0 && found[1] == 0) surfaces_[name] = {label, value, area};
   }
   PulmoUserCheck(!surfaces_.empty(), comm,
-                 "the mesh %s names no surface; give its boundary physical names such as airway and pleura", file_.c_str());
+                 "the mesh %s names no surface; give its boundary physical names such as airway and pleura",
+                 file_.c_str());
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -277,59 +284,56 @@ PetscErrorCode Mesh::node_coordinates(PetscInt point, PetscReal x[3]) const
 PetscErrorCode Mesh::rigid_pins(std::array<Pin, 3> &pins) const
 {
   using Coordinates = std::array<PetscReal, 3>;
+  constexpr PetscReal off_axis = 3; // weight of what leads away from an axis
   const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
   PetscInt begin, end;
+  PetscMPIInt rank;
   std::array<Coordinates, 3> chosen{};
-  const auto minus = [](const Coordinates &a, const Coordinates &b) {
-    return Coordinates{a[0] - b[0], a[1] - b[1], a[2] - b[2]};
-  };
-  const auto cross = [](const Coordinates &a, const Coordinates &b) {
-    return Coordinates{a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]};
-  };
-  const auto norm = [](const Coordinates &a) { return std::hypot(a[0], a[1], a[2]); };
-  const auto largest = [](const Coordinates &a) {
-    int d = 0;
-    for (int i = 1; i < 3; ++i)
-      if (std::abs(a[i]) > std::abs(a[d])) d = i;
-    return d;
-  };
+  int along = 2, across = 0; // the axis that AB is close to; the second axis of the plane that ABC is close to
 
   PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
   PetscCall(DMPlexGetDepthStratum(dm_, 0, &begin, &end));
-  // A: the lowest vertex; B: the farthest from A; C: the farthest from the line AB. Every rank that shares a
-  // vertex has the same coordinates for it, so the choice by coordinates is the same on all.
+  // A: the lowest vertex. B: far from A and close to an axis through A. C: far from AB and close to a plane of two
+  // axes through it. Then the held components hardly turn a lung that swells. Ranks that share a vertex have the same
+  // coordinates for it, so the choice by coordinates is the same on all.
+  const auto score = [&](int k, const Coordinates &x, int axis) {
+    Coordinates d;
+    for (int i = 0; i < 3; ++i) d[i] = std::abs(x[i] - chosen[0][i]);
+    if (k == 0) return -x[2];
+    const int next = (axis + 1) % 3, last = (axis + 2) % 3;
+    if (k == 1) return d[axis] - off_axis * (d[next] + d[last]);
+    return axis == along ? -PETSC_MAX_REAL : d[axis] - off_axis * d[3 - along - axis];
+  };
   for (int k = 0; k < 3; ++k) {
-    double best[4] = {-1e300, 0, 0, 0}, global[4];
-    for (PetscInt v = begin; v < end; ++v) {
-      Coordinates x;
-      PetscCall(node_coordinates(v, x.data()));
-      const PetscReal score = k == 0   ? -x[2]
-                              : k == 1 ? norm(minus(x, chosen[0]))
-                                       : norm(cross(minus(x, chosen[0]), minus(chosen[1], chosen[0])));
-      if (score > best[0]) {
-        best[0] = score;
-        for (int d = 0; d < 3; ++d) best[d + 1] = x[d];
-      }
-    }
     struct {
       double score;
       int rank;
-    } mine, winner;
-    PetscMPIInt rank;
-    PetscCallMPI(MPI_Comm_rank(comm, &rank));
-    mine = {best[0], rank};
-    PetscCallMPI(MPI_Allreduce(&mine, &winner, 1, MPI_DOUBLE_INT, MPI_MAXLOC, comm));
-    for (int d = 0; d < 4; ++d) global[d] = best[d];
-    PetscCallMPI(MPI_Bcast(global, 4, MPI_DOUBLE, winner.rank, comm));
-    for (int d = 0; d < 3; ++d) chosen[k][d] = global[d + 1];
+    } best{-PETSC_MAX_REAL, rank}, winner;
+    double found[4] = {0, 0, 0, 0}; // coordinates, axis
+    for (PetscInt v = begin; v < end; ++v) {
+      Coordinates x;
+      PetscCall(node_coordinates(v, x.data()));
+      for (int axis = 0; axis < 3; ++axis) {
+        const PetscReal s = score(k, x, axis);
+        if (s <= best.score) continue;
+        best.score = s;
+        std::copy(x.begin(), x.end(), found);
+        found[3] = axis;
+      }
+    }
+    PetscCallMPI(MPI_Allreduce(&best, &winner, 1, MPI_DOUBLE_INT, MPI_MAXLOC, comm));
+    PetscCallMPI(MPI_Bcast(found, 4, MPI_DOUBLE, winner.rank, comm));
+    std::copy_n(found, 3, chosen[k].begin());
+    if (k == 1) along = static_cast<int>(found[3]);
+    if (k == 2) across = static_cast<int>(found[3]);
   }
-  const Coordinates AB = minus(chosen[1], chosen[0]), normal = cross(AB, minus(chosen[2], chosen[0]));
   for (int k = 0; k < 3; ++k) {
     Pin &pin = pins[k];
     pin = Pin();
     for (int d = 0; d < 3; ++d) {
       pin.x[d] = chosen[k][d];
-      pin.component[d] = k == 0 || (k == 1 && d != largest(AB)) || (k == 2 && d == largest(normal));
+      pin.component[d] = k == 0 || (k == 1 && d != along) || (k == 2 && d == 3 - along - across);
     }
     for (PetscInt v = begin; v < end; ++v) {
       Coordinates x;

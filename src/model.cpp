@@ -27,25 +27,52 @@ PetscErrorCode Model::build(Composition composition, PetscReal modulus)
   PetscCall(create_fields());
   PetscCall(create_weak_form());
   PetscCall(create_section());
-  PetscCall(assembly_.setup(dm_));
+  PetscDS rate_ds = nullptr;
+  if (!own_) {
+    PetscCall(create_stock());
+    PetscCall(DMGetDS(rate_dm_, &rate_ds));
+  }
+  PetscCall(assembly_.setup(dm_, rate_ds));
   row_scale_.assign(this->composition().fields().size(), 1);
   PetscCall(set_step(1, 0));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
 
-  if (!own_) {
-    // PETSc's own loops get the rates from an auxiliary field of the same discretisation, rows scaled afterwards
-    DM rate_dm;
-    PetscDS ds;
-    PetscSection section;
-    PetscCall(DMClone(dm_, &rate_dm));
-    *rate_dm_.out() = rate_dm;
-    PetscCall(DMCopyFields(dm_, rate_dm_));
-    PetscCall(DMCreateDS(rate_dm_));
-    PetscCall(DMGetDS(rate_dm_, &ds));
-    PetscCall(DMGetLocalSection(dm_, &section));
-    PetscCall(DMSetLocalSection(rate_dm_, section));
-    PetscCall(DMCreateLocalVector(rate_dm_, rate_.out()));
-    PetscCall(DMSetAuxiliaryVec(dm_, nullptr, 0, 0, rate_));
-    PetscCall(DMCreateGlobalVector(dm_, scale_.out()));
+/// For PETSc's own loops over cells: a DM with the volume terms only (PETSc 3.18 has wrong gradients on facets, see
+/// Assembly) and an auxiliary field of the same discretisation that carries the rates.
+PetscErrorCode Model::create_stock()
+{
+  PetscSection section;
+  PetscDS ds;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMGetLocalSection(dm_, &section));
+  for (DMHandle *dm : {&stock_dm_, &rate_dm_}) {
+    PetscCall(DMClone(mesh_->dm(), dm->out()));
+    PetscCall(DMCopyFields(dm_, *dm));
+    PetscCall(DMCreateDS(*dm));
+    PetscCall(DMSetLocalSection(*dm, section));
+  }
+  PetscCall(DMGetDS(stock_dm_, &ds));
+  PetscCall(add_volume_terms(ds));
+  PetscCall(DMCreateLocalVector(rate_dm_, rate_.out()));
+  PetscCall(DMSetAuxiliaryVec(stock_dm_, nullptr, 0, 0, rate_));
+  PetscCall(DMCreateGlobalVector(dm_, scale_.out()));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::add_volume_terms(PetscDS ds) const
+{
+  PetscWeakForm wf;
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscDSGetWeakForm(ds, &wf));
+  for (const Term &t : composition().terms()) {
+    if (!t.surface.empty()) continue;
+    if (t.trial < 0)
+      PetscCall(PetscWeakFormAddResidual(wf, nullptr, 0, t.test, 0, t.f0, t.f1));
+    else
+      PetscCall(PetscWeakFormAddJacobian(wf, nullptr, 0, t.test, t.trial, 0, t.g0, t.g1, t.g2, t.g3));
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -59,7 +86,8 @@ PetscErrorCode Model::create_fields()
 
   PetscFunctionBeginUser;
   PetscCall(PetscDTSimplexQuadrature(3, quadrature_degree_, PETSCDTSIMPLEXQUAD_MINSYM, rule.out()));
-  PetscCall(PetscDTSimplexQuadrature(2, std::max<PetscInt>(4, quadrature_degree_), PETSCDTSIMPLEXQUAD_MINSYM, face_rule.out()));
+  PetscCall(PetscDTSimplexQuadrature(2, std::max<PetscInt>(4, quadrature_degree_), PETSCDTSIMPLEXQUAD_MINSYM,
+                                     face_rule.out()));
   PetscInt index = 0;
   for (const FieldSpec &field : composition().fields()) {
     FEHandle fe;
@@ -86,34 +114,29 @@ PetscErrorCode Model::create_fields()
 PetscErrorCode Model::create_weak_form()
 {
   PetscDS ds;
-  PetscWeakForm volume;
   std::map<std::pair<std::string, PetscInt>, PetscWeakForm> boundary; // of each surface and test field
 
   PetscFunctionBeginUser;
   PetscCall(DMGetDS(dm_, &ds));
-  PetscCall(PetscDSGetWeakForm(ds, &volume));
+  PetscCall(add_volume_terms(ds));
   for (const Term &term : composition().terms()) {
-    if (term.surface.empty()) {
-      if (term.trial < 0) PetscCall(PetscWeakFormAddResidual(volume, nullptr, 0, term.test, 0, term.f0, term.f1));
-      else
-        PetscCall(PetscWeakFormAddJacobian(volume, nullptr, 0, term.test, term.trial, 0, term.g0, term.g1, term.g2, term.g3));
-      continue;
-    }
+    if (term.surface.empty()) continue;
     DMLabel label;
     const PetscInt value = mesh_->surface(term.surface).value;
     PetscCall(DMGetLabel(dm_, term.surface.c_str(), &label));
     PetscWeakForm &wf = boundary[{term.surface, term.test}];
     if (!wf) {
       PetscInt bd;
-      PetscCall(DMAddBoundary(dm_, DM_BC_NATURAL, term.surface.c_str(), label, 1, &value, term.test, 0, nullptr, nullptr,
-                              nullptr, nullptr, &bd));
+      PetscCall(DMAddBoundary(dm_, DM_BC_NATURAL, term.surface.c_str(), label, 1, &value, term.test, 0, nullptr,
+                              nullptr, nullptr, nullptr, &bd));
       PetscCall(PetscDSGetBoundary(ds, bd, &wf, nullptr, nullptr, nullptr, nullptr, nullptr, nullptr, nullptr, nullptr,
                                    nullptr, nullptr, nullptr));
     }
-    if (term.trial < 0) PetscCall(PetscWeakFormAddBdResidual(wf, label, value, term.test, 0, term.bd_f0, term.bd_f1));
+    if (term.trial < 0)
+      PetscCall(PetscWeakFormAddBdResidual(wf, label, value, term.test, 0, term.bd_f0, term.bd_f1));
     else
-      PetscCall(PetscWeakFormAddBdJacobian(wf, label, value, term.test, term.trial, 0, term.bd_g0, term.bd_g1, term.bd_g2,
-                                           term.bd_g3));
+      PetscCall(PetscWeakFormAddBdJacobian(wf, label, value, term.test, term.trial, 0, term.bd_g0, term.bd_g1,
+                                           term.bd_g2, term.bd_g3));
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -213,15 +236,17 @@ PetscErrorCode Model::create_section()
       for (int c = 0; c < 3; ++c)
         if (set & (1 << c)) which.push_back(c);
       owned.emplace_back();
-      PetscCall(ISCreateGeneral(PETSC_COMM_SELF, (PetscInt)which.size(), which.data(), PETSC_COPY_VALUES, owned.back().out()));
+      PetscCall(ISCreateGeneral(PETSC_COMM_SELF, (PetscInt)which.size(), which.data(), PETSC_COPY_VALUES,
+                                owned.back().out()));
       bc_components.push_back(owned.back());
       owned.emplace_back();
-      PetscCall(ISCreateGeneral(PETSC_COMM_SELF, (PetscInt)points.size(), points.data(), PETSC_COPY_VALUES, owned.back().out()));
+      PetscCall(ISCreateGeneral(PETSC_COMM_SELF, (PetscInt)points.size(), points.data(), PETSC_COPY_VALUES,
+                                owned.back().out()));
       bc_points.push_back(owned.back());
       bc_field.push_back(f);
     }
-  PetscCall(DMPlexCreateSection(dm_, labels.data(), components.data(), dofs.data(), (PetscInt)bc_field.size(), bc_field.data(),
-                                bc_components.data(), bc_points.data(), nullptr, section.out()));
+  PetscCall(DMPlexCreateSection(dm_, labels.data(), components.data(), dofs.data(), (PetscInt)bc_field.size(),
+                                bc_field.data(), bc_components.data(), bc_points.data(), nullptr, section.out()));
   for (PetscInt f = 0; f < n_fields; ++f) PetscCall(PetscSectionSetFieldName(section, f, fields[f].name.c_str()));
   PetscCall(DMSetLocalSection(dm_, section));
 
@@ -277,6 +302,10 @@ PetscErrorCode Model::pack_constants()
   for (const ParameterBlock &block : blocks) constants_.insert(constants_.end(), block.data, block.data + block.count);
   PetscCall(DMGetDS(dm_, &ds));
   PetscCall(PetscDSSetConstants(ds, offset, constants_.data()));
+  if (stock_dm_) {
+    PetscCall(DMGetDS(stock_dm_, &ds));
+    PetscCall(PetscDSSetConstants(ds, offset, constants_.data()));
+  }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -305,8 +334,8 @@ PetscErrorCode Model::residual(PetscReal t, Vec x, Vec x_t, Vec F)
 {
   PetscFunctionBeginUser;
   PetscCall(VecZeroEntries(F));
-  if (own_) PetscCall(assembly_.residual(t, x, x_t, row_scale_.data(), F));
-  else PetscCall(stock_residual(t, x, x_t, F));
+  if (!own_) PetscCall(stock_residual(t, x, x_t, F));
+  PetscCall(assembly_.residual(own_ ? Assembly::Part::all : Assembly::Part::facets, t, x, x_t, row_scale_.data(), F));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -315,7 +344,7 @@ PetscErrorCode Model::stock_residual(PetscReal t, Vec x, Vec x_t, Vec F)
 {
   PetscFunctionBeginUser;
   PetscCall(VecCopy(x_t, rate_));
-  PetscCall(DMPlexTSComputeIFunctionFEM(dm_, t, x, x_t, F, nullptr));
+  PetscCall(DMPlexTSComputeIFunctionFEM(stock_dm_, t, x, x_t, F, nullptr));
   WriteArray f(F);
   PetscSection section;
   PetscInt begin, end;
@@ -334,18 +363,23 @@ PetscErrorCode Model::stock_residual(PetscReal t, Vec x, Vec x_t, Vec F)
 PetscErrorCode Model::jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, Mat A)
 {
   PetscFunctionBeginUser;
-  if (own_) {
-    PetscCall(assembly_.jacobian(t, x, x_t, shift, row_scale_.data(), A));
-    PetscFunctionReturn(PETSC_SUCCESS);
-  }
+  if (!own_) PetscCall(stock_jacobian(t, x, x_t, shift, A));
+  PetscCall(
+      assembly_.jacobian(own_ ? Assembly::Part::all : Assembly::Part::facets, t, x, x_t, shift, row_scale_.data(), A));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// The same for the Jacobian.
+PetscErrorCode Model::stock_jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, Mat A)
+{
+  PetscFunctionBeginUser;
   PetscCall(VecCopy(x_t, rate_));
-  PetscCall(DMPlexTSComputeIJacobianFEM(dm_, t, x, x_t, shift, A, A, nullptr));
+  PetscCall(DMPlexTSComputeIJacobianFEM(stock_dm_, t, x, x_t, shift, A, A, nullptr));
   for (std::size_t field = 0; field < row_scale_.size(); ++field) {
     ISHandle rows;
-    DM unused = nullptr;
+    DMHandle unused;
     const auto f = static_cast<PetscInt>(field);
-    PetscCall(DMCreateSubDM(dm_, 1, &f, rows.out(), &unused));
-    PetscCall(DMDestroy(&unused));
+    PetscCall(DMCreateSubDM(dm_, 1, &f, rows.out(), unused.out()));
     PetscCall(VecISSet(scale_, rows, row_scale_[field]));
   }
   PetscCall(MatDiagonalScale(A, scale_, nullptr));

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdlib>
+#include <optional>
 #include <sstream>
 
 namespace pulmo {
@@ -51,6 +52,26 @@ std::size_t distance(const std::string &a, const std::string &b)
   return row[b.size()];
 }
 
+/// What the value of a flag says, in any case; empty if it says neither.
+std::optional<bool> truth(std::string value)
+{
+  std::transform(value.begin(), value.end(), value.begin(), [](unsigned char c) { return std::tolower(c); });
+  for (const char *yes : {"", "on", "true", "yes", "1"})
+    if (value == yes) return true;
+  for (const char *no : {"off", "false", "no", "0"})
+    if (value == no) return false;
+  return {};
+}
+
+/// Whether the last `-name` of the list says off.
+bool turned_off(const std::vector<std::pair<std::string, std::string>> &list, const std::string &name)
+{
+  bool off = false;
+  for (const auto &[option, value] : list)
+    if (option == "-" + name) off = truth(value) == false;
+  return off;
+}
+
 } // namespace
 
 std::string Range::text() const
@@ -97,7 +118,7 @@ PetscErrorCode Options::find(const std::string &name, const std::string &default
   PetscCall(PetscOptionsGetString(nullptr, nullptr, option.c_str(), buffer, sizeof(buffer), &set));
   PetscCall(PetscOptionsHasName(nullptr, nullptr, option.c_str(), &has));
   is_given = has && group.in_use; // check_unknown() reports an option of an effect or law that is not in use
-  if (is_given) raw = buffer;
+  if (has) raw = buffer;
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -108,8 +129,8 @@ PetscErrorCode Options::parse_number(const std::string &option, const std::strin
 
   PetscFunctionBeginUser;
   value = std::strtod(raw.c_str(), &end);
-  PulmoUserCheck(!raw.empty() && *end == '\0' && std::isfinite(value), comm_,
-                 "option %s takes a number (%s), not '%s'", option.c_str(), unit.c_str(), raw.c_str());
+  PulmoUserCheck(!raw.empty() && *end == '\0' && std::isfinite(value), comm_, "option %s takes a number (%s), not '%s'",
+                 option.c_str(), unit.c_str(), raw.c_str());
   PulmoUserCheck(range.holds(value), comm_, "option %s %s (%s) is out of range; it must be %s", option.c_str(),
                  raw.c_str(), unit.c_str(), range.text().c_str());
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -157,12 +178,9 @@ PetscErrorCode Options::flag(const std::string &name, const std::string &help, b
   PetscFunctionBeginUser;
   PetscCall(find(name, value ? "on" : "off", "on/off", "", help, raw, is_given));
   if (is_given) {
-    static const std::vector<std::string> yes{"", "on", "true", "yes", "1"}, no{"off", "false", "no", "0"};
-    std::transform(raw.begin(), raw.end(), raw.begin(), [](unsigned char c) { return std::tolower(c); });
-    const bool on = std::find(yes.begin(), yes.end(), raw) != yes.end();
-    PulmoUserCheck(on || std::find(no.begin(), no.end(), raw) != no.end(), comm_, "option %s is on or off, not '%s'",
-                   full(name).c_str(), raw.c_str());
-    value = on;
+    const std::optional<bool> on = truth(raw);
+    PulmoUserCheck(on, comm_, "option %s is on or off, not '%s'", full(name).c_str(), raw.c_str());
+    value = *on;
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -205,7 +223,8 @@ PetscErrorCode Options::names(const std::string &name, const std::string &help, 
 
   PetscFunctionBeginUser;
   PetscCall(find(name, join(value, ","), "names, separated by commas", "", help, raw, is_given));
-  if (is_given) {
+  // also of an effect that is not in use: its options for each of these names are then known, too
+  if (!raw.empty() || is_given) {
     value = split(raw, ',');
     PulmoUserCheck(!value.empty(), comm_, "option %s names nothing", full(name).c_str());
     auto sorted = value;
@@ -223,8 +242,8 @@ PetscErrorCode Options::vector(const std::string &name, const std::string &unit,
   bool is_given;
 
   PetscFunctionBeginUser;
-  PetscCall(find(name, number_text(value[0]) + "," + number_text(value[1]) + "," + number_text(value[2]), unit, "", help,
-                 raw, is_given));
+  PetscCall(find(name, number_text(value[0]) + "," + number_text(value[1]) + "," + number_text(value[2]), unit, "",
+                 help, raw, is_given));
   if (is_given) {
     const auto parts = split(raw, ',');
     PulmoUserCheck(parts.size() == 3, comm_, "option %s takes three numbers (%s) separated by commas, not '%s'",
@@ -264,8 +283,10 @@ PetscErrorCode Options::all_given(std::vector<std::pair<std::string, std::string
   // the database prints "-name value -name value ..."; a value never begins with '-' and a letter
   for (std::string word; stream >> word;) {
     const bool is_name = word.size() > 1 && word[0] == '-' && std::isalpha(static_cast<unsigned char>(word[1]));
-    if (is_name) list.emplace_back(word, "");
-    else if (!list.empty()) list.back().second += (list.back().second.empty() ? "" : " ") + word;
+    if (is_name)
+      list.emplace_back(word, "");
+    else if (!list.empty())
+      list.back().second += (list.back().second.empty() ? "" : " ") + word;
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -281,10 +302,13 @@ PetscErrorCode Options::check_unknown() const
     bool in_use = false;
     for (const Declared &d : declared_) {
       if (d.name != name) continue;
-      if (groups_[d.group].in_use) in_use = true;
-      else idle = &d;
+      if (groups_[d.group].in_use)
+        in_use = true;
+      else
+        idle = &d;
     }
-    if (in_use) continue;
+    // an effect that the user turned off on purpose may keep its settings (from a scene file)
+    if (in_use || (idle && turned_off(list, groups_[idle->group].name))) continue;
     PulmoUserCheck(!idle, comm_, "option %s has no effect in this scene: it needs %s", name.c_str(),
                    groups_[idle->group].enabled_by.c_str());
     for (const Group &group : groups_) {
@@ -318,13 +342,15 @@ PetscErrorCode Options::warn_unused() const
 
 PetscErrorCode Options::print_help() const
 {
-  std::size_t last = groups_.size();
+  std::string last;
 
   PetscFunctionBeginUser;
-  PetscCall(PetscPrintf(comm_, "pulmo's own options (beside PETSc's: -dm_plex_filename, -ts_*, -snes_*, -ksp_*, -pc_*):\n"));
+  PetscCall(
+      PetscPrintf(comm_, "pulmo's own options (beside PETSc's: -dm_plex_filename, -ts_*, -snes_*, -ksp_*, -pc_*):\n"));
   for (const Declared &d : declared_) {
-    if (d.group != last) PetscCall(PetscPrintf(comm_, "\n%s\n", groups_[d.group].about.c_str()));
-    last = d.group;
+    const std::string &about = groups_[d.group].about;
+    if (about != last) PetscCall(PetscPrintf(comm_, "\n%s\n", about.c_str()));
+    last = about;
     PetscCall(PetscPrintf(comm_, "  %-34s %s [%s]%s (default %s)\n", d.name.c_str(), d.help.c_str(), d.unit.c_str(),
                           d.range.empty() || d.range == "any" ? "" : (" " + d.range).c_str(),
                           d.value.empty() ? "none" : d.value.c_str()));

@@ -66,7 +66,8 @@ PetscErrorCode Output::prepare(const Options &options)
                  directory_.c_str());
   if (rank == 0) { // what an earlier run left must not pass for this one's
     std::error_code error;
-    for (const char *old : {"summary.json", "failure.json", "signals.csv", "signals.csv.part", "fields.xdmf", "fields.h5"})
+    for (const char *old :
+         {"summary.json", "failure.json", "signals.csv", "signals.csv.part", "fields.xdmf", "fields.h5"})
       fs::remove(path(old), error);
     for (const auto &entry : fs::directory_iterator(directory_, error)) {
       const std::string name = entry.path().filename().string();
@@ -95,7 +96,8 @@ PetscErrorCode SignalWriter::observe(const StepReport &step)
       file_ = std::fopen(output_.path("signals.csv.part").c_str(), "w");
       if (file_)
         std::fprintf(file_, "time_s,%s%svolume_ml,%sdt_s,newton_iterations,krylov_iterations,min_J,max_J\n",
-                     ventilator ? "airway_pressure_cmH2O," : "", flow ? "flow_ml_per_s," : "", ventilator ? "phase," : "");
+                     ventilator ? "airway_pressure_cmH2O," : "", flow ? "flow_ml_per_s," : "",
+                     ventilator ? "phase," : "");
     }
     if (file_) {
       const SignalRow &r = step.row;
@@ -148,8 +150,8 @@ PetscErrorCode ProgressPrinter::observe(const StepReport &step)
     PetscFunctionReturn(PETSC_SUCCESS);
   }
   const double left = r.time > 0 ? (now - start_) * (step.end - r.time) / r.time : 0;
-  PetscCall(PetscPrintf(comm_, "%9.4f %10.3g %6ld %6ld %10.3f %10.3f %8.4f %8.0f  %s\n", r.time, r.dt, r.newton, r.krylov,
-                        r.pressure, r.volume, r.min_J, left, facts_.ventilator ? r.phase.c_str() : ""));
+  PetscCall(PetscPrintf(comm_, "%9.4f %10.3g %6ld %6ld %10.3f %10.3f %8.4f %8.0f  %s\n", r.time, r.dt, r.newton,
+                        r.krylov, r.pressure, r.volume, r.min_J, left, facts_.ventilator ? r.phase.c_str() : ""));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

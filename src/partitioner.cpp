@@ -29,8 +29,8 @@ PetscErrorCode partition_metis(PetscPartitioner partitioner, PetscInt n_parts, P
     idx_t nv = n_vertices, ncon = 1, np = n_parts, cut = 0, options[METIS_NOPTIONS];
     METIS_SetDefaultOptions(options);
     options[METIS_OPTION_SEED] = 1;
-    const int code = METIS_PartGraphKway(&nv, &ncon, xadj.data(), adjncy.data(), nullptr, nullptr, nullptr, &np, nullptr,
-                                         nullptr, options, &cut, part.data());
+    const int code = METIS_PartGraphKway(&nv, &ncon, xadj.data(), adjncy.data(), nullptr, nullptr, nullptr, &np,
+                                         nullptr, nullptr, options, &cut, part.data());
     PetscCheck(code == METIS_OK, PETSC_COMM_SELF, PETSC_ERR_LIB, "METIS_PartGraphKway returned %d", code);
   }
   std::vector<PetscInt> count(static_cast<std::size_t>(n_parts) + 1, 0);

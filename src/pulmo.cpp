@@ -10,7 +10,8 @@ namespace {
 PetscErrorCode handle_error(MPI_Comm comm, int line, const char *function, const char *file, PetscErrorCode code,
                             PetscErrorType type, const char *message, void *context)
 {
-  if (code != PETSC_ERR_USER_INPUT) return PetscTraceBackErrorHandler(comm, line, function, file, code, type, message, context);
+  if (code != PETSC_ERR_USER_INPUT)
+    return PetscTraceBackErrorHandler(comm, line, function, file, code, type, message, context);
   if (type == PETSC_ERROR_INITIAL) {
     PetscMPIInt rank = 0;
     (void)MPI_Comm_rank(comm, &rank);
@@ -48,10 +49,8 @@ PetscErrorCode initialize()
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-Run::Run(const Registry &registry)
-    : options_(PETSC_COMM_WORLD), scene_(registry), simulation_(options_, scene_, model_)
-{
-}
+Run::Run(const Registry &registry) : options_(PETSC_COMM_WORLD), scene_(registry), simulation_(options_, scene_, model_)
+{}
 
 PetscErrorCode Run::declare()
 {
@@ -103,6 +102,10 @@ PetscErrorCode run(const Registry &registry, bool &finished)
     finished = true;
     PetscFunctionReturn(PETSC_SUCCESS);
   }
+  PulmoUserCheck(
+      run.model().composition().held(), comm,
+      "nothing holds the lung in place: give -chest_wall (springs), or -support -support_rigid to let it move "
+      "freely but for the six rigid-body motions");
   PetscCall(output.prepare(options));
 
   SignalWriter signals(comm, output, scene.facts());

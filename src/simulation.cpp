@@ -2,9 +2,9 @@
 
 #include "pulmo/units.hpp"
 
-#include <petsc/private/tsimpl.h>
 #include <algorithm>
 #include <cmath>
+#include <petsc/private/tsimpl.h>
 #include <sstream>
 
 namespace pulmo {
@@ -13,6 +13,17 @@ namespace {
 
 /// Two times closer than this share of the step are the same.
 constexpr PetscReal same_time = 1e-9;
+
+/// A step cut below this share of the one asked for ends the run (-ts_adapt_dt_min may end it earlier).
+constexpr PetscReal least_step = 1e-6;
+
+/// So do as many accepted steps in a row below this share of the step asked for: the run only crawls towards a state
+/// that it cannot pass.
+constexpr PetscReal crawling_step = 1e-3;
+constexpr int crawling_steps = 50;
+
+/// Failed attempts that are remembered.
+constexpr std::size_t max_failures = 12;
 
 class Stopwatch {
 public:
@@ -78,8 +89,8 @@ PetscErrorCode check_stage(TSAdapt, TS ts, PetscReal, Vec X, PetscBool *accept)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode choose_step(TSAdapt adapt, TS ts, PetscReal h, PetscInt *next_scheme, PetscReal *next_h, PetscBool *accept,
-                           PetscReal *wlte, PetscReal *wltea, PetscReal *wlter)
+PetscErrorCode choose_step(TSAdapt adapt, TS ts, PetscReal h, PetscInt *next_scheme, PetscReal *next_h,
+                           PetscBool *accept, PetscReal *wlte, PetscReal *wltea, PetscReal *wlter)
 {
   Simulation *simulation;
 
@@ -136,8 +147,9 @@ PetscErrorCode Simulation::create_solver()
 
   PetscFunctionBeginUser;
   PetscCall(PetscOptionsGetString(nullptr, nullptr, "-pc_type", pc_type, sizeof(pc_type), &has_pc));
-  PulmoUserCheck(has_pc, comm,
-                 "no linear solver: give a solver file, e.g. -options_file petsc_options/solvers/direct.opts (or -pc_type)");
+  PulmoUserCheck(
+      has_pc, comm,
+      "no linear solver: give a solver file, e.g. -options_file petsc_options/solvers/direct.opts (or -pc_type)");
   PetscCall(PetscStrcmp(pc_type, PCFIELDSPLIT, &is_fieldsplit));
 
   PetscCall(TSCreate(comm, ts_.out()));
@@ -182,8 +194,10 @@ std::vector<Phase> Simulation::phases() const
   std::vector<Phase> list;
 
   (void)TSGetMaxTime(ts_, &max_time);
-  if (scene_.facts().ventilator) list = scene_.facts().ventilator->phases();
-  else list.push_back({"run", 0, 0, max_time < PETSC_MAX_REAL ? max_time : 1, 0, 0, 0});
+  if (scene_.facts().ventilator)
+    list = scene_.facts().ventilator->phases();
+  else
+    list.push_back({"run", 0, 0, max_time < PETSC_MAX_REAL ? max_time : 1, 0, 0, 0});
   while (list.size() > 1 && list.back().begin >= max_time) list.pop_back();
   list.back().end = std::min(list.back().end, max_time);
   return list;
@@ -199,8 +213,10 @@ PetscReal Simulation::landing(PetscReal t) const
 
 PetscReal Simulation::next_step(PetscReal t, PetscReal h, PetscReal growth)
 {
-  if (!failures_.empty()) dt_ = h;                                              // it took cuts to get here
-  else if (h >= dt_ * (1 - same_time)) dt_ = std::min(wanted_dt_, growth * dt_); // a full step: grow back
+  if (cut_)
+    dt_ = h; // it took cuts to get here
+  else if (h >= dt_ * (1 - same_time))
+    dt_ = std::min(wanted_dt_, growth * dt_); // a full step: grow back
   return landing(t);
 }
 
@@ -306,8 +322,7 @@ PetscErrorCode Simulation::after_stage()
   if (reason < 0) {
     PetscReal dt;
     PetscCall(TSGetTimeStep(ts_, &dt));
-    failures_.push_back({accepted_.time, dt, SNESConvergedReasons[reason], newton, inverted_measures_, inverted_});
-    ++rejected_;
+    PetscCall(reject(dt, SNESConvergedReasons[reason], newton, inverted_measures_, inverted_));
   }
   inverted_ = false;
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -325,10 +340,24 @@ PetscErrorCode Simulation::accept_stage(Vec X, PetscBool *accept)
   PetscCall(model_.constrain(t + dt, local_));
   PetscCall(model_.measure(local_, measures));
   *accept = PetscBool(measures.min_J > 0);
-  if (!*accept) {
-    failures_.push_back({t, dt, "converged to a state with J <= 0", 0, measures, true});
-    ++rejected_;
-  }
+  if (!*accept) PetscCall(reject(dt, "converged to a state with J <= 0", 0, measures, true));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Simulation::reject(PetscReal dt, const std::string &reason, PetscInt newton, const Measures &measures,
+                                  bool inverted)
+{
+  TSAdapt adapt;
+
+  PetscFunctionBeginUser;
+  if (failures_.size() == max_failures) failures_.erase(failures_.begin());
+  failures_.push_back({accepted_.time, dt, reason, newton, measures, inverted});
+  cut_ = true;
+  ++rejected_;
+  PetscCall(TSGetAdapt(ts_, &adapt));
+  const PetscReal next = dt * adapt->scale_solve_failed;
+  if (next < std::max(adapt->dt_min, least_step * wanted_dt_))
+    PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -337,11 +366,16 @@ PetscErrorCode Simulation::after_step()
   Measures measures;
   PetscReal t;
   SignalRow row;
+  TSConvergedReason reason;
 
   PetscFunctionBeginUser;
+  PetscCall(TSGetConvergedReason(ts_, &reason));
+  if (reason < 0) PetscFunctionReturn(PETSC_SUCCESS); // PETSc calls this after a step that it gave up, too
   PetscCall(TSGetTime(ts_, &t));
   row.dt = t - accepted_.time;
-  failures_.clear();
+  cut_ = false;
+  crawled_ = row.dt < crawling_step * wanted_dt_ && row.time != phase_->end ? crawled_ + 1 : 0;
+  if (crawled_ == 0) failures_.clear();
 
   // state and consistent flux of the accepted step
   PetscCall(model_.set_step(row.dt, scene_.facts().airway_pressure(t)));
@@ -372,6 +406,7 @@ PetscErrorCode Simulation::after_step()
   delivered_ += row.dt * row.flow * units::mm3_per_ml;
   accepted_ = row;
   PetscCall(report(row, measures));
+  if (crawled_ == crawling_steps) PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

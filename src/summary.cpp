@@ -12,7 +12,10 @@ namespace {
 
 using Json = nlohmann::ordered_json;
 
-Json optional_json(const std::optional<double> &v) { return v ? Json(*v) : Json(nullptr); }
+Json optional_json(const std::optional<double> &v)
+{
+  return v ? Json(*v) : Json(nullptr);
+}
 
 void add_numbers(Json &json, const ClinicalNumbers &n)
 {
@@ -113,21 +116,28 @@ PetscErrorCode print_numbers(MPI_Comm comm, const Output &output, const Scene &s
   PetscFunctionBeginUser;
   if (scene.facts().ventilator) {
     const ClinicalNumbers n = overall_numbers(simulation.rows(), scene.ventilator().peep());
-    PetscCall(PetscPrintf(comm, "\nThe lung (%.0f ml at rest, %s tissue) took %.1f ml per breath at a peak airway pressure of "
-                                "%.2f cmH2O; %.1f ml stayed behind.\n",
-                          (double)(scene.mesh().volume() / units::mm3_per_ml), scene.tissue().law().name(), n.tidal_volume,
-                          n.peak_pressure, n.trapped_volume));
+    PetscCall(
+        PetscPrintf(comm,
+                    "\nThe lung (%.0f ml at rest, %s tissue) took %.1f ml per breath at a peak airway pressure of "
+                    "%.2f cmH2O; %.1f ml stayed behind.\n",
+                    (double)(scene.mesh().volume() / units::mm3_per_ml), scene.tissue().law().name(), n.tidal_volume,
+                    n.peak_pressure, n.trapped_volume));
     if (n.compliance)
-      PetscCall(PetscPrintf(comm, "Respiratory-system compliance %.2f ml/cmH2O, resistance %.3f cmH2O s/l, time constant "
-                                  "%.3f s (single-compartment fit).\n", *n.compliance, *n.resistance, *n.time_constant));
-    PetscCall(PetscPrintf(comm, "Driving pressure %.2f cmH2O, peak flow %.0f ml/s, work %.4f J per breath, mechanical power "
-                                "%.3f J/min.\n", n.driving_pressure, n.peak_flow, n.work, n.mechanical_power));
+      PetscCall(PetscPrintf(comm,
+                            "Respiratory-system compliance %.2f ml/cmH2O, resistance %.3f cmH2O s/l, time constant "
+                            "%.3f s (single-compartment fit).\n",
+                            *n.compliance, *n.resistance, *n.time_constant));
+    PetscCall(PetscPrintf(comm,
+                          "Driving pressure %.2f cmH2O, peak flow %.0f ml/s, work %.4f J per breath, mechanical power "
+                          "%.3f J/min.\n",
+                          n.driving_pressure, n.peak_flow, n.work, n.mechanical_power));
   }
   PetscCall(PetscPrintf(comm, "Smallest J %.4f", (double)simulation.min_J()));
   if (scene.facts().airflow)
-    PetscCall(PetscPrintf(comm, "; air lost by the numbers: %.2g ml", (double)(simulation.mass_balance_error() / units::mm3_per_ml)));
-  PetscCall(PetscPrintf(comm, ".\nWrote %s, %s, %s.\n", output.path("signals.csv").c_str(), output.path("summary.json").c_str(),
-                        output.path("fields.xdmf").c_str()));
+    PetscCall(PetscPrintf(comm, "; air lost by the numbers: %.2g ml",
+                          (double)(simulation.mass_balance_error() / units::mm3_per_ml)));
+  PetscCall(PetscPrintf(comm, ".\nWrote %s, %s, %s.\n", output.path("signals.csv").c_str(),
+                        output.path("summary.json").c_str(), output.path("fields.xdmf").c_str()));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -150,8 +160,9 @@ PetscErrorCode print_ledger(MPI_Comm comm, const Scene &scene, const Model &mode
     for (auto g : {t.g0, t.g1, t.g2, t.g3}) charge(reinterpret_cast<void (*)(void)>(g), t.effect);
   }
   for (const auto &[effect, s] : spent) timed += s;
-  PetscCall(PetscPrintf(comm, "\nEffects of this scene (seconds of its volume terms: one block in %d timed)\n%-16s %-22s %-9s %s\n",
-                        (int)Assembly::timed_share, "effect", "fields", "seconds", "share of run, terms, blocks"));
+  PetscCall(PetscPrintf(
+      comm, "\nEffects of this scene (seconds of its volume terms: one block in %d timed)\n%-16s %-22s %-9s %s\n",
+      (int)Assembly::timed_share, "effect", "fields", "seconds", "share of run, terms, blocks"));
   for (const Effect *effect : scene.active()) {
     const std::string name = effect->name();
     std::string own_fields, terms;
@@ -160,22 +171,27 @@ PetscErrorCode print_ledger(MPI_Comm comm, const Scene &scene, const Model &mode
     for (const Term &t : composition.terms()) {
       if (t.effect != name) continue;
       const std::string where = t.surface.empty() ? "" : " on " + t.surface;
-      if (t.trial < 0) terms += "\n    " + t.name + where + "  (row " + fields[t.test].name + ")";
-      else terms += "\n    " + t.name + where + "  [" + fields[t.test].name + ", " + fields[t.trial].name + "]";
+      if (t.trial < 0)
+        terms += "\n    " + t.name + where + "  (row " + fields[t.test].name + ")";
+      else
+        terms += "\n    " + t.name + where + "  [" + fields[t.test].name + ", " + fields[t.trial].name + "]";
     }
     for (const Constraint &c : composition.constraints())
       if (c.effect == name)
         terms += "\n    " + c.name + " prescribed" + (c.surface.empty() ? " at vertices" : " on " + c.surface) + "  (" +
                  fields[c.field].name + ")";
-    PetscCall(PetscPrintf(comm, "%-16s %-22s %9.4f %5.1f %%%s\n", name.c_str(), own_fields.empty() ? "-" : own_fields.c_str(),
-                          spent[name], seconds.total > 0 ? 100 * spent[name] / seconds.total : 0, terms.c_str()));
+    PetscCall(PetscPrintf(comm, "%-16s %-22s %9.4f %5.1f %%%s\n", name.c_str(),
+                          own_fields.empty() ? "-" : own_fields.c_str(), spent[name],
+                          seconds.total > 0 ? 100 * spent[name] / seconds.total : 0, terms.c_str()));
   }
   const double residual_points = log.residual_cells > 0 ? (double)log.residual_calls / (double)log.residual_cells : 0;
   const double jacobian_points = log.jacobian_cells > 0 ? (double)log.jacobian_calls / (double)log.jacobian_cells : 0;
-  PetscCall(PetscPrintf(comm, "callbacks per cell: residual %.0f, Jacobian %.0f; run: setup %.3f s, residual %.3f s, Jacobian %.3f s, "
-                              "solve %.3f s, output %.3f s (callbacks above %.3f s)\n",
-                        residual_points, jacobian_points, seconds.setup, seconds.residual, seconds.jacobian, seconds.solve,
-                        seconds.output, timed));
+  PetscCall(PetscPrintf(
+      comm,
+      "callbacks per cell: residual %.0f, Jacobian %.0f; run: setup %.3f s, residual %.3f s, Jacobian %.3f s, "
+      "solve %.3f s, output %.3f s (callbacks above %.3f s)\n",
+      residual_points, jacobian_points, seconds.setup, seconds.residual, seconds.jacobian, seconds.solve,
+      seconds.output, timed));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -13,11 +13,11 @@ namespace pulmo {
 
 /// What a state of the lung measures, over all ranks.
 struct Measures {
-  PetscReal volume_change = 0;        ///< int (J - 1) over the reference volume, mm^3
-  PetscReal min_J = 1, max_J = 1;     ///< over quadrature points and cell corners
-  PetscReal min_J_points = 1;         ///< over quadrature points only
-  PetscReal where[3] = {0, 0, 0};     ///< material centroid of the cell with min_J, mm
-  PetscInt cell = -1;                 ///< its number on rank @p rank
+  PetscReal volume_change = 0;    ///< int (J - 1) over the reference volume, mm^3
+  PetscReal min_J = 1, max_J = 1; ///< over quadrature points and cell corners
+  PetscReal min_J_points = 1;     ///< over quadrature points only
+  PetscReal where[3] = {0, 0, 0}; ///< material centroid of the cell with min_J, mm
+  PetscInt cell = -1;             ///< its number on rank @p rank
   PetscMPIInt rank = 0;
 };
 
@@ -34,12 +34,16 @@ public:
   Assembly(const Assembly &) = delete;
   Assembly &operator=(const Assembly &) = delete;
 
-  PetscErrorCode setup(DM dm);
+  /// What is assembled: everything, or the facets only (cells are then PETSc's own affair).
+  enum class Part { all, facets };
 
-  /// F = residual of the local vectors @p x and @p x_t; rows of field f are multiplied by row_scale[f].
-  PetscErrorCode residual(PetscReal t, Vec x, Vec x_t, const PetscReal row_scale[], Vec F);
-  /// A = dF/dx + shift dF/dx_t, rows scaled alike.
-  PetscErrorCode jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[], Mat A);
+  /// @p rate_ds: for PetscFE types other than pulmo's, the PetscDS of the auxiliary field that carries x_t.
+  PetscErrorCode setup(DM dm, PetscDS rate_ds);
+
+  /// Adds the residual of the local vectors @p x and @p x_t to F; rows of field f are multiplied by row_scale[f].
+  PetscErrorCode residual(Part part, PetscReal t, Vec x, Vec x_t, const PetscReal row_scale[], Vec F);
+  /// A = dF/dx + shift dF/dx_t, rows scaled alike; Part::facets adds to A.
+  PetscErrorCode jacobian(Part part, PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[], Mat A);
   /// J and its integral for the local vector @p x.
   PetscErrorCode measure(Vec x, Measures &measures) const;
 
@@ -57,13 +61,16 @@ private:
 
   PetscErrorCode setup_cells();
   PetscErrorCode setup_facets();
-  void gather(PetscInt cell, const ReadArray &x, PetscScalar *coefficients) const;
+  /// Gathers coefficients in blocks of cells, then of facets, integrates each block and scatters the results.
+  template <class OnCells, class OnFacets, class Scatter>
+  PetscErrorCode for_blocks(Part part, Vec x, Vec x_t, PetscInt result_size, OnCells &&on_cells, OnFacets &&on_facets,
+                            Scatter &&scatter);
   PetscFEGeom block_geometry(PetscInt begin, PetscInt n);
   PetscErrorCode map_matrix(Mat A);
   PetscErrorCode add_to_matrix(PetscInt cell, const PetscScalar *matrix, const PetscReal row_scale[], Mat A);
 
   DM dm_ = nullptr; ///< not owned
-  PetscDS ds_ = nullptr;
+  PetscDS ds_ = nullptr, rate_ds_ = nullptr;
   PetscInt n_fields_ = 0, cells_ = 0, first_cell_ = 0, element_size_ = 0, points_per_cell_ = 0;
   std::vector<PetscInt> cell_dofs_;   ///< [cell][element_size]: offset in the local vector
   std::vector<PetscInt> cell_points_; ///< [cell][points_per_cell]: mesh points that carry dofs

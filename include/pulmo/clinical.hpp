@@ -24,17 +24,17 @@ struct SignalRow {
 
 /// Numbers of one breath, or of a whole run. What a breath does not define stays empty.
 struct ClinicalNumbers {
-  std::optional<double> compliance;        ///< C_rs of the fit, ml/cmH2O
-  std::optional<double> resistance;        ///< R of the fit, cmH2O s/l
-  std::optional<double> time_constant;     ///< R C_rs, s
-  std::optional<double> plateau_pressure;  ///< airway pressure at the end of the pause, cmH2O
-  double peak_pressure = 0;                ///< cmH2O
-  double driving_pressure = 0;             ///< plateau - PEEP (peak - PEEP without a pause), cmH2O
-  double tidal_volume = 0;                 ///< ml
-  double trapped_volume = 0;               ///< ml
-  double peak_flow = 0;                    ///< ml/s
-  double work = 0;                         ///< closed integral of (P - PEEP) dV, J
-  double mechanical_power = 0;             ///< work times rate, J/min
+  std::optional<double> compliance;       ///< C_rs of the fit, ml/cmH2O
+  std::optional<double> resistance;       ///< R of the fit, cmH2O s/l
+  std::optional<double> time_constant;    ///< R C_rs, s
+  std::optional<double> plateau_pressure; ///< airway pressure at the end of the pause, cmH2O
+  double peak_pressure = 0;               ///< cmH2O
+  double driving_pressure = 0;            ///< plateau - PEEP (peak - PEEP without a pause), cmH2O
+  double tidal_volume = 0;                ///< ml
+  double trapped_volume = 0;              ///< ml
+  double peak_flow = 0;                   ///< ml/s
+  double work = 0;                        ///< closed integral of (P - PEEP) dV, J
+  double mechanical_power = 0;            ///< work times rate, J/min
 };
 
 /// Least-squares fit of P - PEEP = E (V - V_start) + R flow with weights dt (Aviles-Rojas & Hurtado 2022, eq. 52)

@@ -45,9 +45,9 @@ struct Constraint {
   std::string effect, name;
   PetscInt field = displacement;
   bool component[3] = {false, false, false};
-  std::string surface;                ///< empty: at @p vertices
-  std::vector<PetscInt> vertices;     ///< local mesh points (on every rank that has them)
-  bool at_airway = false;             ///< the condition that the ventilator steers
+  std::string surface;            ///< empty: at @p vertices
+  std::vector<PetscInt> vertices; ///< local mesh points (on every rank that has them)
+  bool at_airway = false;         ///< the condition that the ventilator steers
   /// Value of all components at time t (s) and material point x (mm).
   std::function<void(PetscReal t, const PetscReal x[3], PetscScalar value[3])> value;
 };
@@ -124,6 +124,16 @@ public:
   {
     c.effect = effect_;
     constraints_.push_back(std::move(c));
+  }
+
+  /// Whether anything holds the lung in place: prescribed displacement, or a term that resists displacement itself.
+  bool held() const
+  {
+    for (const Constraint &c : constraints_)
+      if (c.field == displacement) return true;
+    for (const Term &t : terms_)
+      if (t.test == displacement && t.trial == displacement && (t.g0 || t.bd_g0)) return true;
+    return false;
   }
 
   const std::vector<FieldSpec> &fields() const { return fields_; }

@@ -20,12 +20,12 @@ namespace pulmo {
 
 /// What the integrator counts. Composed with the PetscDS under the name "pulmo_integration_log".
 struct IntegrationLog {
-  bool timing = false;                         ///< whether the block of cells at hand is timed
-  long long residual_calls = 0;                ///< volume callbacks called in residuals, over all points
-  long long residual_cells = 0;                ///< cells in those residuals
-  long long jacobian_calls = 0;                ///< the same for Jacobians
+  bool timing = false;          ///< whether the block of cells at hand is timed
+  long long residual_calls = 0; ///< volume callbacks called in residuals, over all points
+  long long residual_cells = 0; ///< cells in those residuals
+  long long jacobian_calls = 0; ///< the same for Jacobians
   long long jacobian_cells = 0;
-  std::map<void (*)(void), double> seconds;    ///< of each callback, in the blocks that were timed
+  std::map<void (*)(void), double> seconds; ///< of each callback, in the blocks that were timed
 
   /// Makes @p log known to the integrator of @p ds.
   static PetscErrorCode attach(PetscDS ds, IntegrationLog *log);

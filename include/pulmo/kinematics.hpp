@@ -56,8 +56,7 @@ static inline PetscScalar determinant(const PetscScalar A[9])
 /// det(I + H) - 1 = tr H + tr cof H + det H: full relative accuracy for small H, where det F - 1 has none.
 static inline PetscScalar jacobian_minus_one(const PetscScalar H[9])
 {
-  const PetscScalar tr_cof =
-    (H[4] * H[8] - H[5] * H[7]) + (H[0] * H[8] - H[2] * H[6]) + (H[0] * H[4] - H[1] * H[3]);
+  const PetscScalar tr_cof = (H[4] * H[8] - H[5] * H[7]) + (H[0] * H[8] - H[2] * H[6]) + (H[0] * H[4] - H[1] * H[3]);
   return (H[0] + H[4] + H[8]) + tr_cof + determinant(H);
 }
 

@@ -46,10 +46,10 @@ public:
 
 private:
   struct Prescribed {
-    PetscInt dof;                ///< offset in the local vector
-    std::int16_t constraint;     ///< which of the composition
+    PetscInt dof;            ///< offset in the local vector
+    std::int16_t constraint; ///< which of the composition
     std::int16_t component;
-    PetscReal x[3];              ///< mm
+    PetscReal x[3]; ///< mm
   };
 
   PetscErrorCode create_fields();
@@ -57,11 +57,14 @@ private:
   PetscErrorCode create_section();
   PetscErrorCode find_constraints(std::vector<PetscInt> &constraint_of);
   PetscErrorCode pack_constants();
+  PetscErrorCode add_volume_terms(PetscDS ds) const;
+  PetscErrorCode create_stock();
   PetscErrorCode stock_residual(PetscReal t, Vec x, Vec x_t, Vec F);
+  PetscErrorCode stock_jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, Mat A);
 
   std::unique_ptr<Composition> composition_;
   const Mesh *mesh_ = nullptr;
-  DMHandle dm_, rate_dm_;
+  DMHandle dm_, stock_dm_, rate_dm_;
   VecHandle rate_, scale_;
   std::vector<Prescribed> prescribed_;
   std::vector<PetscScalar> constants_;

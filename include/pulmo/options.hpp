@@ -57,7 +57,8 @@ public:
   /// Whether the user gave `-<group>_<name>` of the current group.
   PetscErrorCode given(const std::string &name, bool &is_given) const;
 
-  /// Ends with a user error if the database holds a name under one of pulmo's prefixes that nothing declared.
+  /// Ends with a user error if the database holds a name under one of pulmo's prefixes that nothing declared, or one
+  /// of an effect that is not in use (unless that effect was turned off by `-<effect> off`).
   PetscErrorCode check_unknown() const;
   /// Warns of PETSc options that nobody read, with the nearest name that pulmo knows.
   PetscErrorCode warn_unused() const;

@@ -30,7 +30,9 @@ private:
 /// Writes signals.csv.part row by row and renames it at the end.
 class SignalWriter final : public Observer {
 public:
-  SignalWriter(MPI_Comm comm, const Output &output, const SceneFacts &facts) : comm_(comm), output_(output), facts_(facts) {}
+  SignalWriter(MPI_Comm comm, const Output &output, const SceneFacts &facts)
+      : comm_(comm), output_(output), facts_(facts)
+  {}
   ~SignalWriter() override;
   PetscErrorCode observe(const StepReport &step) override;
   PetscErrorCode finish();
@@ -70,8 +72,8 @@ private:
   const Output &output_;
   const Scene &scene_;
   Model &model_;
-  std::vector<PetscInt> nodes_;        ///< local mesh points that carry a node and are owned here
-  std::vector<PetscInt> node_number_;  ///< [local mesh point]: global node number, -1 without node
+  std::vector<PetscInt> nodes_;       ///< local mesh points that carry a node and are owned here
+  std::vector<PetscInt> node_number_; ///< [local mesh point]: global node number, -1 without node
   PetscInt n_nodes_ = -1, n_cells_ = 0;
   std::vector<PetscReal> times_;
   PetscReal next_ = 0;

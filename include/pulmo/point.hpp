@@ -69,14 +69,14 @@ struct Step {
 
 /// A quadrature point as a kernel sees it.
 struct Point {
-  const PointState &state;         ///< F, J, rates
-  const PetscScalar *u;            ///< displacement, mm
-  PetscScalar p = 0;               ///< alveolar pressure, kPa (airflow only)
-  const PetscScalar *grad_p;       ///< Grad p, kPa/mm (null without airflow)
-  PetscReal t;                     ///< time, s
-  PetscReal shift;                 ///< d(u_t)/du in Jacobians, 1/s
-  const PetscReal *x;              ///< material coordinates, mm
-  const PetscReal *normal;         ///< outward unit normal (surface kernels only)
+  const PointState &state;   ///< F, J, rates
+  const PetscScalar *u;      ///< displacement, mm
+  PetscScalar p = 0;         ///< alveolar pressure, kPa (airflow only)
+  const PetscScalar *grad_p; ///< Grad p, kPa/mm (null without airflow)
+  PetscReal t;               ///< time, s
+  PetscReal shift;           ///< d(u_t)/du in Jacobians, 1/s
+  const PetscReal *x;        ///< material coordinates, mm
+  const PetscReal *normal;   ///< outward unit normal (surface kernels only)
   Step step;
 
   /// Pressure of the gas in the pores: the local field, or the uniform pressure without airflow, kPa.
@@ -89,20 +89,29 @@ constexpr PetscInt precomputed_state = -1;
 namespace detail {
 
 /// The arguments that all four kinds of callback begin with.
-#define PULMO_POINT_ARGUMENTS                                                                                     \
-  PetscInt, PetscInt Nf, PetscInt NfAux, const PetscInt uOff[], const PetscInt uOff_x[], const PetscScalar u[],   \
-    const PetscScalar[], const PetscScalar u_x[], const PetscInt[], const PetscInt aOff_x[], const PetscScalar a[], \
-    const PetscScalar[], const PetscScalar a_x[], PetscReal t
+#define PULMO_POINT_ARGUMENTS                                                                                          \
+  PetscInt, PetscInt Nf, PetscInt NfAux, const PetscInt uOff[], const PetscInt uOff_x[], const PetscScalar u[],        \
+      const PetscScalar[], const PetscScalar u_x[], const PetscInt[], const PetscInt aOff_x[], const PetscScalar a[],  \
+      const PetscScalar[], const PetscScalar a_x[], PetscReal t
 
-/// The state at a point: handed in by pulmo's integrator, or made here (stock PetscFE, where an auxiliary
-/// field of the same discretisation carries u_t).
-static inline const PointState &state_of(PetscInt NfAux, const PetscInt uOff_x[], const PetscScalar u_x[],
-                                         const PetscInt aOff_x[], const PetscScalar a[], const PetscScalar a_x[],
-                                         PointState &storage)
+/// The point of a callback. Its kinematic state is handed in by pulmo's integrator, or made here in @p storage
+/// (stock PetscFE, where an auxiliary field of the same discretisation carries u_t).
+static inline Point make_point(PointState &storage, PetscInt Nf, PetscInt NfAux, const PetscInt uOff[],
+                               const PetscInt uOff_x[], const PetscScalar u[], const PetscScalar u_x[],
+                               const PetscInt aOff_x[], const PetscScalar a[], const PetscScalar a_x[], PetscReal t,
+                               PetscReal shift, const PetscReal x[], const PetscReal normal[], const PetscScalar c[])
 {
-  if (NfAux == precomputed_state) return *reinterpret_cast<const PointState *>(a);
-  make_point_state(u_x + uOff_x[displacement], NfAux > 0 ? a_x + aOff_x[displacement] : nullptr, storage);
-  return storage;
+  const bool made = NfAux == precomputed_state, gas = Nf > pressure;
+  if (!made) make_point_state(u_x + uOff_x[displacement], NfAux > 0 ? a_x + aOff_x[displacement] : nullptr, storage);
+  return {made ? *reinterpret_cast<const PointState *>(a) : storage,
+          u + uOff[displacement],
+          gas ? u[uOff[pressure]] : 0,
+          gas ? u_x + uOff_x[pressure] : nullptr,
+          t,
+          shift,
+          x,
+          normal,
+          constants::get<Step>(c)};
 }
 
 } // namespace detail
@@ -115,10 +124,7 @@ template <class P, Kernel<P> K>
 void volume_residual(PULMO_POINT_ARGUMENTS, const PetscReal x[], PetscInt, const PetscScalar c[], PetscScalar f[])
 {
   PointState storage;
-  const PointState &s = detail::state_of(NfAux, uOff_x, u_x, aOff_x, a, a_x, storage);
-  const bool gas = Nf > pressure;
-  K({s, u + uOff[displacement], gas ? u[uOff[pressure]] : 0, gas ? u_x + uOff_x[pressure] : nullptr, t, 0, x, nullptr,
-     constants::get<Step>(c)},
+  K(detail::make_point(storage, Nf, NfAux, uOff, uOff_x, u, u_x, aOff_x, a, a_x, t, 0, x, nullptr, c),
     constants::get<P>(c), f);
 }
 
@@ -128,10 +134,7 @@ void volume_jacobian(PULMO_POINT_ARGUMENTS, PetscReal shift, const PetscReal x[]
                      PetscScalar g[])
 {
   PointState storage;
-  const PointState &s = detail::state_of(NfAux, uOff_x, u_x, aOff_x, a, a_x, storage);
-  const bool gas = Nf > pressure;
-  K({s, u + uOff[displacement], gas ? u[uOff[pressure]] : 0, gas ? u_x + uOff_x[pressure] : nullptr, t, shift, x,
-     nullptr, constants::get<Step>(c)},
+  K(detail::make_point(storage, Nf, NfAux, uOff, uOff_x, u, u_x, aOff_x, a, a_x, t, shift, x, nullptr, c),
     constants::get<P>(c), g);
 }
 
@@ -141,11 +144,8 @@ void surface_residual(PULMO_POINT_ARGUMENTS, const PetscReal x[], const PetscRea
                       PetscScalar f[])
 {
   PointState storage;
-  const PointState &s = detail::state_of(NfAux, uOff_x, u_x, aOff_x, a, a_x, storage);
-  const bool gas = Nf > pressure;
-  K({s, u + uOff[displacement], gas ? u[uOff[pressure]] : 0, gas ? u_x + uOff_x[pressure] : nullptr, t, 0, x, n,
-     constants::get<Step>(c)},
-    constants::get<P>(c), f);
+  K(detail::make_point(storage, Nf, NfAux, uOff, uOff_x, u, u_x, aOff_x, a, a_x, t, 0, x, n, c), constants::get<P>(c),
+    f);
 }
 
 /// Callback of a surface Jacobian term.
@@ -154,10 +154,7 @@ void surface_jacobian(PULMO_POINT_ARGUMENTS, PetscReal shift, const PetscReal x[
                       const PetscScalar c[], PetscScalar g[])
 {
   PointState storage;
-  const PointState &s = detail::state_of(NfAux, uOff_x, u_x, aOff_x, a, a_x, storage);
-  const bool gas = Nf > pressure;
-  K({s, u + uOff[displacement], gas ? u[uOff[pressure]] : 0, gas ? u_x + uOff_x[pressure] : nullptr, t, shift, x, n,
-     constants::get<Step>(c)},
+  K(detail::make_point(storage, Nf, NfAux, uOff, uOff_x, u, u_x, aOff_x, a, a_x, t, shift, x, n, c),
     constants::get<P>(c), g);
 }
 

@@ -33,7 +33,7 @@ private:
   Mesh mesh_;
   SceneFacts facts_;
   std::vector<std::unique_ptr<Effect>> effects_;
-  Tissue *tissue_;         // these three are elements of effects_
+  Tissue *tissue_; // these three are elements of effects_
   Airflow *airflow_;
   Ventilator *ventilator_;
 };

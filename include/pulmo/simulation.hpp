@@ -27,10 +27,10 @@ public:
 
 /// An attempt at a step that was not accepted.
 struct FailedAttempt {
-  PetscReal time, dt;    ///< where the step began and how long it was, s
+  PetscReal time, dt; ///< where the step began and how long it was, s
   std::string reason;
   PetscInt newton;
-  Measures measures;     ///< of the last state with J <= 0, if any
+  Measures measures; ///< of the last state with J <= 0, if any
   bool inverted;
 };
 
@@ -41,7 +41,8 @@ struct StageSeconds {
 
 class Simulation {
 public:
-  Simulation(const Options &options, const Scene &scene, Model &model) : options_(options), scene_(scene), model_(model) {}
+  Simulation(const Options &options, const Scene &scene, Model &model) : options_(options), scene_(scene), model_(model)
+  {}
 
   /// Creates TS, SNES, KSP and the matrix from the options database.
   PetscErrorCode setup();
@@ -52,8 +53,8 @@ public:
   PetscErrorCode run(bool &finished);
 
   TS ts() const { return ts_; }
-  Vec state() const { return state_; }          ///< global vector, the last accepted state
-  Vec local_state() const { return before_; }   ///< the same, local, constrained values in place
+  Vec state() const { return state_; }        ///< global vector, the last accepted state
+  Vec local_state() const { return before_; } ///< the same, local, constrained values in place
   PetscReal time() const { return accepted_.time; }
   const std::vector<SignalRow> &rows() const { return rows_; }
   const std::vector<FailedAttempt> &failures() const { return failures_; }
@@ -78,6 +79,9 @@ private:
   /// Step size from time @p t, shortened to land on the end of the ramp or of the phase.
   PetscReal landing(PetscReal t) const;
   PetscErrorCode scatter(PetscReal t, Vec X, Vec Xdot);
+  /// Notes an attempt that failed; ends the run if the next one would be too short.
+  PetscErrorCode reject(PetscReal dt, const std::string &reason, PetscInt newton, const Measures &measures,
+                        bool inverted);
   PetscErrorCode report(const SignalRow &row, const Measures &measures);
   std::vector<Phase> phases() const;
 
@@ -97,6 +101,8 @@ private:
   PetscReal delivered_ = 0, worst_balance_ = 0, min_J_ = 1;
   PetscInt newton_ = 0, krylov_ = 0, rejected_ = 0;
   bool inverted_ = false; ///< the attempt at hand met J <= 0
+  bool cut_ = false;      ///< the step at hand was cut
+  int crawled_ = 0;       ///< accepted steps in a row that were tiny
   Measures inverted_measures_;
   std::vector<FailedAttempt> failures_;
   StageSeconds seconds_;

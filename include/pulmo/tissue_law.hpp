@@ -75,7 +75,8 @@ struct TissueKernels {
     const PetscScalar I1 = inv.I1_minus_3 + 3;
     for (int i = 0; i < 3; ++i)
       for (int j = 0; j < 3; ++j)
-        B[3 * i + j] = I1 * s.F[3 * i + j] - (s.F[3 * i] * C[j] + s.F[3 * i + 1] * C[3 + j] + s.F[3 * i + 2] * C[6 + j]);
+        B[3 * i + j] =
+            I1 * s.F[3 * i + j] - (s.F[3 * i] * C[j] + s.F[3 * i + 1] * C[3 + j] + s.F[3 * i + 2] * C[6 + j]);
   }
 
   /// Adds the effective first Piola-Kirchhoff stress P' = dW/dF (kPa) to f1:

@@ -47,8 +47,7 @@ struct AirflowKernels {
     cofactor(s.H_rate, cof_rate);
     tensor_cross(s.F, s.H_rate, cross);
     // d/dF gives cross - dt cof_rate, d/dF' gives cof F - dt cross + dt^2 cof_rate
-    for (int i = 0; i < 9; ++i)
-      g1[i] += (1 - a * dt) * (cross[i] - dt * cof_rate[i]) + a * s.cof_F[i];
+    for (int i = 0; i < 9; ++i) g1[i] += (1 - a * dt) * (cross[i] - dt * cof_rate[i]) + a * s.cof_F[i];
   }
 };
 

@@ -99,6 +99,7 @@ public:
     PetscFunctionBeginUser;
     c.parameters(parameters_);
     for (std::size_t i = 0; i < surfaces_.size(); ++i) {
+      if (parameters_.stiffness[i] == 0) continue;
       c.surface_residual("K_s u . eta", surfaces_[i], displacement, residuals[i], nullptr);
       c.surface_jacobian("K_s", surfaces_[i], displacement, displacement, jacobians[i], nullptr, nullptr, nullptr);
     }

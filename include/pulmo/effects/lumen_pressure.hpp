@@ -33,8 +33,7 @@ struct LumenPressureKernels {
   {
     const PetscScalar *cof = point.state.cof_F;
     const PetscReal *N = point.normal;
-    for (int i = 0; i < 3; ++i)
-      g0[i] += (cof[3 * i] * N[0] + cof[3 * i + 1] * N[1] + cof[3 * i + 2] * N[2]);
+    for (int i = 0; i < 3; ++i) g0[i] += (cof[3 * i] * N[0] + cof[3 * i + 1] * N[1] + cof[3 * i + 2] * N[2]);
   }
 };
 

@@ -27,7 +27,8 @@ public:
     for (const std::string &surface : surfaces_) {
       Held held;
       PetscCall(options.text("components_" + surface, "which components, of x, y and z, e.g. xz", held.components));
-      PetscCall(options.vector("displacement_" + surface, "mm", "their values on surface " + surface, held.value.data()));
+      PetscCall(
+          options.vector("displacement_" + surface, "mm", "their values on surface " + surface, held.value.data()));
       PulmoUserCheck(!held.components.empty() && held.components.find_first_not_of("xyz") == std::string::npos,
                      options.comm(), "-support_components_%s '%s' is not made of the letters x, y and z",
                      surface.c_str(), held.components.c_str());

@@ -53,8 +53,8 @@ public:
                    static_cast<int>(TractionKernels::max_surfaces));
     for (std::size_t i = 0; i < surfaces_.size(); ++i) {
       for (int d = 0; d < 3; ++d) parameters_.value[i][d] = common[d];
-      PetscCall(options.vector("value_" + surfaces_[i], "kPa", "traction on surface " + surfaces_[i],
-                               parameters_.value[i]));
+      PetscCall(
+          options.vector("value_" + surfaces_[i], "kPa", "traction on surface " + surfaces_[i], parameters_.value[i]));
     }
     PetscFunctionReturn(PETSC_SUCCESS);
   }
@@ -69,7 +69,8 @@ public:
 
   PetscErrorCode terms(Composition &c, const SceneFacts &) const override
   {
-    static constexpr auto residuals = TractionKernels::residuals(std::make_index_sequence<TractionKernels::max_surfaces>());
+    static constexpr auto residuals =
+        TractionKernels::residuals(std::make_index_sequence<TractionKernels::max_surfaces>());
 
     PetscFunctionBeginUser;
     c.parameters(parameters_);

@@ -1,0 +1,326 @@
+// Kernels of the effects at one point: closed forms, and every Jacobian kernel against its residual kernel.
+#include "unit/tensors.hpp"
+
+#include "pulmo/effects/airflow.hpp"
+#include "pulmo/effects/chest_wall.hpp"
+#include "pulmo/effects/lumen_pressure.hpp"
+#include "pulmo/effects/traction.hpp"
+#include "pulmo/effects/ventilator.hpp"
+
+namespace pulmo::test {
+namespace {
+
+/// k(J) = k0 J^m + k1 J: a law whose derivative does not vanish.
+struct PowerPermeability {
+  struct Parameters {
+    static constexpr const char *owner = "permeability";
+    PetscScalar k0 = 0.8, m = 2.5, k1 = 0.3;
+  };
+  static PermeabilityValue permeability(PetscScalar J, const Parameters &p)
+  {
+    return {p.k0 * std::pow(J, p.m) + p.k1 * J, p.k0 * p.m * std::pow(J, p.m - 1) + p.k1};
+  }
+};
+
+/// Everything that a kernel may read, as values that differences can change one by one.
+struct Data {
+  Tensor H{}, rate{};
+  double u[3]{}, p = 0, grad_p[3]{}, x[3]{}, normal[3]{0, 0, 1};
+  Step step{0.05, 0.4};
+  double shift = 0;
+  bool airflow = true;
+
+  explicit Data(Random &random, double J)
+  {
+    H = random_deformation(random, J) - identity;
+    rate = random.tensor(4);
+    p = random(-0.3, 1);
+    for (int d = 0; d < 3; ++d) {
+      u[d] = random();
+      grad_p[d] = random();
+      normal[d] = random(0.1, 1);
+    }
+    const double length = std::sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]);
+    for (double &n : normal) n /= length;
+    shift = random(1, 40);
+  }
+  Tensor F() const { return H + identity; }
+  Tensor cof() const { return det(F()) * transposed(inverse(F())); }
+
+  template <class P>
+  std::vector<double> call(Kernel<P> kernel, const P &parameters, std::size_t size) const
+  {
+    PointState s;
+    make_point_state(H.data(), rate.data(), s);
+    std::vector<double> out(size, 0.125); // kernels add
+    kernel({s, u, p, airflow ? grad_p : nullptr, 0.2, shift, x, normal, step}, parameters, out.data());
+    for (double &o : out) o -= 0.125;
+    return out;
+  }
+};
+
+/// Checks tangent[index(c, k, ...)] = d residual_c / d variable_k for one set of variables; @p change moves variable
+/// k by a step. @p place tells where the derivative of component c by variable k is stored.
+template <class P>
+void expect_derivative(const Data &data, Kernel<P> residual, Kernel<P> tangent, const P &parameters, int components,
+                       int variables, const std::function<void(Data &, int, double)> &change,
+                       const std::function<int(int, int)> &place)
+{
+  const auto A = data.call(tangent, parameters, static_cast<std::size_t>(components * variables));
+  double scale = 0;
+  for (double a : A) scale = std::max(scale, std::abs(a));
+  ASSERT_GT(scale, 0);
+  for (int c = 0; c < components; ++c)
+    for (int k = 0; k < variables; ++k) {
+      const double expected = derivative(
+          [&](double step) {
+            Data moved = data;
+            change(moved, k, step);
+            return moved.call(residual, parameters, static_cast<std::size_t>(components))[c];
+          },
+          3e-4);
+      EXPECT_NEAR(A[place(c, k)], expected, 2e-10 * scale) << "component " << c << " by variable " << k;
+    }
+}
+
+/// Moves H, and with it the rate, as an implicit step does.
+void move_H(Data &d, int k, double step)
+{
+  d.H[k] += step;
+  d.rate[k] += d.shift * step;
+}
+void move_p(Data &d, int, double step)
+{
+  d.p += step;
+}
+void move_grad_p(Data &d, int k, double step)
+{
+  d.grad_p[k] += step;
+}
+void move_u(Data &d, int k, double step)
+{
+  d.u[k] += step;
+}
+
+/// g3 of (vector, vector): [i][k][J][L] for residual component 3 i + J and variable 3 k + L.
+int vector_by_vector(int c, int v)
+{
+  return 27 * (c / 3) + 9 * (v / 3) + 3 * (c % 3) + v % 3;
+}
+/// g3 of (scalar, vector): [k][I][L].
+int scalar_by_vector(int I, int v)
+{
+  return 9 * (v / 3) + 3 * I + v % 3;
+}
+/// g1 of (vector, vector): [i][k][L], and everything else that is stored [component][variable].
+int nine(int c, int v)
+{
+  return 9 * c + v;
+}
+int three(int c, int v)
+{
+  return 3 * c + v;
+}
+int one(int c, int)
+{
+  return c;
+}
+
+template <class Check>
+void at_points(Check check)
+{
+  Random random(41);
+  for (double J : {0.3, 0.8, 1.0, 1.6, 3.0})
+    for (int i = 0; i < 4; ++i) {
+      SCOPED_TRACE("J = " + std::to_string(J));
+      check(Data(random, J));
+    }
+}
+
+constexpr NoParameters none;
+
+TEST(Airflow, GasStressIsMinusPressureTimesCofactor)
+{
+  at_points([](const Data &d) {
+    const auto f1 = d.call<NoParameters>(AirflowKernels::gas_stress, none, 9);
+    for (int i = 0; i < 9; ++i) EXPECT_NEAR(f1[i], -d.p * d.cof()[i], 1e-13 * 10);
+    expect_derivative<NoParameters>(d, AirflowKernels::gas_stress, AirflowKernels::gas_stress_by_displacement, none, 9,
+                                    9, move_H, vector_by_vector);
+    expect_derivative<NoParameters>(d, AirflowKernels::gas_stress, AirflowKernels::gas_stress_by_pressure, none, 9, 1,
+                                    move_p, one);
+  });
+}
+
+TEST(Airflow, PorosityRateIsTheExactDifferenceQuotient)
+{
+  at_points([](Data d) {
+    for (double dt : {0.5, 0.05, 1e-3, 1e-7}) {
+      d.step.dt = dt;
+      const double rate_size = 0.3 / std::max(dt, 0.05); // keeps the state before the step moderate
+      d.rate = (rate_size / 4) * d.rate;
+      long double now[9], before[9];
+      for (int i = 0; i < 9; ++i) {
+        now[i] = static_cast<long double>(d.H[i]) + identity[i];
+        before[i] = now[i] - static_cast<long double>(dt) * d.rate[i];
+      }
+      const auto expected = static_cast<double>((det(now) - det(before)) / dt);
+      // for tiny steps even long double cancels
+      EXPECT_NEAR(d.call<NoParameters>(AirflowKernels::porosity_rate, none, 1)[0], expected,
+                  1e-13 * (1 + std::abs(rate_size)) + 4e-18 / dt);
+    }
+  });
+}
+
+TEST(Airflow, PorosityRateDerivativeForAnyShift)
+{
+  at_points([](Data d) {
+    for (double shift : {1 / d.step.dt, 7.0, 0.0, 55.0}) {
+      d.shift = shift;
+      expect_derivative<NoParameters>(d, AirflowKernels::porosity_rate, AirflowKernels::porosity_rate_by_displacement,
+                                      none, 1, 9, move_H, nine);
+    }
+  });
+}
+
+template <class Law>
+void expect_darcy(const Data &d, const typename Law::Parameters &k)
+{
+  using K = DarcyKernels<Law>;
+  using P = typename Law::Parameters;
+  // -Q = k J F^-1 F^-T Grad p
+  const Tensor inverse_F = inverse(d.F()), inverse_C = inverse_F * transposed(inverse_F);
+  const double J = det(d.F());
+  const auto flux = d.call<P>(K::flux, k, 3);
+  for (int I = 0; I < 3; ++I) {
+    double expected = 0;
+    for (int L = 0; L < 3; ++L) expected += Law::permeability(J, k).k * J * inverse_C[3 * I + L] * d.grad_p[L];
+    EXPECT_NEAR(flux[I], expected, 1e-12 * (1 + std::abs(expected)));
+  }
+  expect_derivative<P>(d, K::flux, K::flux_by_pressure, k, 3, 3, move_grad_p, three);
+  expect_derivative<P>(d, K::flux, K::flux_by_displacement, k, 3, 9, move_H, scalar_by_vector);
+}
+
+TEST(Airflow, DarcyFluxWithConstantPermeability)
+{
+  ConstantPermeability::Parameters k;
+  k.k = 0.7;
+  at_points([&](const Data &d) { expect_darcy<ConstantPermeability>(d, k); });
+}
+
+TEST(Airflow, DarcyFluxWithPermeabilityThatFollowsJ)
+{
+  at_points([](const Data &d) { expect_darcy<PowerPermeability>(d, {}); });
+}
+
+TEST(Airflow, DarcyFluxIsFrameIndifferent)
+{
+  Random random(43);
+  at_points([&](const Data &d) {
+    Data turned = d;
+    turned.H = random_rotation(random) * d.F() - identity;
+    const auto a = d.call<PowerPermeability::Parameters>(DarcyKernels<PowerPermeability>::flux, {}, 3);
+    const auto b = turned.call<PowerPermeability::Parameters>(DarcyKernels<PowerPermeability>::flux, {}, 3);
+    for (int I = 0; I < 3; ++I) EXPECT_NEAR(a[I], b[I], 1e-12 * (1 + std::abs(a[I])));
+  });
+}
+
+TEST(Ventilator, UniformGasStressTakesThePressureOfTheStep)
+{
+  at_points([](Data d) {
+    d.airflow = false;
+    const auto f1 = d.call<NoParameters>(UniformGasKernels::gas_stress, none, 9);
+    for (int i = 0; i < 9; ++i) EXPECT_NEAR(f1[i], -0.4 * d.cof()[i], 1e-13 * 10);
+    expect_derivative<NoParameters>(d, UniformGasKernels::gas_stress, UniformGasKernels::gas_stress_by_displacement,
+                                    none, 9, 9, move_H, vector_by_vector);
+  });
+}
+
+TEST(LumenPressure, WallTraction)
+{
+  at_points([](Data d) {
+    for (bool airflow : {true, false}) {
+      d.airflow = airflow;
+      const double p = airflow ? d.p : 0.4;
+      const auto f0 = d.call<NoParameters>(LumenPressureKernels::wall, none, 3);
+      for (int i = 0; i < 3; ++i) {
+        double cof_N = 0;
+        for (int J = 0; J < 3; ++J) cof_N += d.cof()[3 * i + J] * d.normal[J];
+        EXPECT_NEAR(f0[i], p * cof_N, 1e-13 * 20); // weak form: minus the traction -p cof F N
+      }
+      expect_derivative<NoParameters>(d, LumenPressureKernels::wall, LumenPressureKernels::wall_by_displacement, none,
+                                      3, 9, move_H, nine);
+    }
+    d.airflow = true;
+    expect_derivative<NoParameters>(d, LumenPressureKernels::wall, LumenPressureKernels::wall_by_pressure, none, 3, 1,
+                                    move_p, one);
+  });
+}
+
+TEST(ChestWall, SpringsResistTheVectorOrItsNormalPart)
+{
+  using K = ChestWallKernels;
+  at_points([](const Data &d) {
+    K::Parameters k{};
+    k.stiffness[0] = 0.08;
+    k.stiffness[3] = 0.5;
+    for (double normal_only : {0.0, 1.0}) {
+      k.normal_only = normal_only;
+      const double u_N = d.u[0] * d.normal[0] + d.u[1] * d.normal[1] + d.u[2] * d.normal[2];
+      const auto first = d.call<K::Parameters>(K::spring<0>, k, 3), fourth = d.call<K::Parameters>(K::spring<3>, k, 3);
+      for (int i = 0; i < 3; ++i) {
+        const double resisted = normal_only != 0 ? u_N * d.normal[i] : d.u[i];
+        EXPECT_NEAR(first[i], 0.08 * resisted, 1e-15 * 4); // minus the traction -K_s u
+        EXPECT_NEAR(fourth[i], 0.5 * resisted, 1e-15 * 4);
+      }
+      expect_derivative<K::Parameters>(d, K::spring<0>, K::spring_tangent<0>, k, 3, 3, move_u, three);
+      expect_derivative<K::Parameters>(d, K::spring<3>, K::spring_tangent<3>, k, 3, 3, move_u, three);
+    }
+  });
+}
+
+TEST(Traction, IsADeadLoadPerReferenceArea)
+{
+  using K = TractionKernels;
+  at_points([](const Data &d) {
+    K::Parameters k{};
+    for (int i = 0; i < 3; ++i) {
+      k.value[0][i] = 0.1 * (i + 1);
+      k.value[5][i] = -0.7 * i;
+    }
+    const auto first = d.call<K::Parameters>(K::load<0>, k, 3), sixth = d.call<K::Parameters>(K::load<5>, k, 3);
+    for (int i = 0; i < 3; ++i) {
+      EXPECT_NEAR(first[i], -0.1 * (i + 1), 1e-15);
+      EXPECT_NEAR(sixth[i], 0.7 * i, 1e-15);
+    }
+  });
+}
+
+struct A {
+  static constexpr const char *owner = "a";
+  PetscScalar one, two;
+};
+struct B {
+  static constexpr const char *owner = "b";
+  PetscScalar three;
+};
+struct C {
+  static constexpr const char *owner = "c";
+  PetscScalar absent;
+};
+
+TEST(Constants, EveryOwnerFindsItsOwnBlock)
+{
+  const PetscScalar c[] = {2, constants::tag("b"), 5, constants::tag("a"), 6, 3, 1, 2};
+  EXPECT_EQ(constants::get<A>(c).one, 1);
+  EXPECT_EQ(constants::get<A>(c).two, 2);
+  EXPECT_EQ(constants::get<B>(c).three, 3);
+  EXPECT_EQ(constants::get<C>(c).absent, 0);
+  // the names in use have tags of their own, exact in a double
+  const char *owners[] = {"step",     "tissue",     "permeability", "chest_wall",
+                          "traction", "ventilator", "airflow",      "support"};
+  for (const char *a : owners)
+    for (const char *b : owners) EXPECT_EQ(constants::tag(a) == constants::tag(b), std::string(a) == b);
+}
+
+} // namespace
+} // namespace pulmo::test

@@ -1,0 +1,203 @@
+/// @file
+/// Small tensors, random deformations and numerical derivatives for the unit tests.
+#pragma once
+
+#include "pulmo/registry.hpp"
+
+#include <gtest/gtest.h>
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <functional>
+#include <random>
+#include <string>
+#include <vector>
+
+namespace pulmo::test {
+
+using Tensor = std::array<double, 9>;
+constexpr Tensor identity{1, 0, 0, 0, 1, 0, 0, 0, 1};
+
+/// Uniform random numbers, the same in every run.
+class Random {
+public:
+  explicit Random(unsigned seed) : engine_(seed) {}
+  double operator()(double low = -1, double high = 1)
+  {
+    return low + (high - low) * static_cast<double>(engine_()) / static_cast<double>(std::mt19937::max());
+  }
+  Tensor tensor(double size)
+  {
+    Tensor T;
+    for (double &t : T) t = (*this)(-size, size);
+    return T;
+  }
+
+private:
+  std::mt19937 engine_;
+};
+
+inline Tensor operator*(double a, Tensor T)
+{
+  for (double &t : T) t *= a;
+  return T;
+}
+inline Tensor operator+(Tensor A, const Tensor &B)
+{
+  for (int i = 0; i < 9; ++i) A[i] += B[i];
+  return A;
+}
+inline Tensor operator-(const Tensor &A, const Tensor &B)
+{
+  return A + -1.0 * B;
+}
+inline Tensor operator*(const Tensor &A, const Tensor &B)
+{
+  Tensor C{};
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j)
+      for (int k = 0; k < 3; ++k) C[3 * i + j] += A[3 * i + k] * B[3 * k + j];
+  return C;
+}
+inline Tensor transposed(const Tensor &A)
+{
+  return {A[0], A[3], A[6], A[1], A[4], A[7], A[2], A[5], A[8]};
+}
+inline double dot(const Tensor &A, const Tensor &B)
+{
+  double s = 0;
+  for (int i = 0; i < 9; ++i) s += A[i] * B[i];
+  return s;
+}
+inline double largest(const Tensor &A)
+{
+  double m = 0;
+  for (double a : A) m = std::max(m, std::abs(a));
+  return m;
+}
+/// det A by the Leibniz sum.
+template <class T>
+T det(const T A[9])
+{
+  return A[0] * A[4] * A[8] + A[1] * A[5] * A[6] + A[2] * A[3] * A[7] - A[2] * A[4] * A[6] - A[1] * A[3] * A[8] -
+         A[0] * A[5] * A[7];
+}
+inline double det(const Tensor &A)
+{
+  return det(A.data());
+}
+/// A^-1 by Gauss-Jordan elimination with pivoting.
+inline Tensor inverse(Tensor A)
+{
+  Tensor B = identity;
+  for (int c = 0; c < 3; ++c) {
+    int p = c;
+    for (int r = c + 1; r < 3; ++r)
+      if (std::abs(A[3 * r + c]) > std::abs(A[3 * p + c])) p = r;
+    for (int j = 0; j < 3; ++j) {
+      std::swap(A[3 * p + j], A[3 * c + j]);
+      std::swap(B[3 * p + j], B[3 * c + j]);
+    }
+    const double pivot = A[3 * c + c];
+    for (int j = 0; j < 3; ++j) {
+      A[3 * c + j] /= pivot;
+      B[3 * c + j] /= pivot;
+    }
+    for (int r = 0; r < 3; ++r) {
+      const double f = A[3 * r + c];
+      if (r == c) continue;
+      for (int j = 0; j < 3; ++j) {
+        A[3 * r + j] -= f * A[3 * c + j];
+        B[3 * r + j] -= f * B[3 * c + j];
+      }
+    }
+  }
+  return B;
+}
+
+/// A rotation about a random axis (Rodrigues).
+inline Tensor random_rotation(Random &random)
+{
+  double n[3] = {random(), random(), random() + 0.1};
+  const double length = std::sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2]), angle = random(0.5, 3);
+  for (double &v : n) v /= length;
+  const Tensor K{0, -n[2], n[1], n[2], 0, -n[0], -n[1], n[0], 0};
+  return identity + std::sin(angle) * K + (1 - std::cos(angle)) * (K * K);
+}
+
+/// A deformation gradient with det F = @p J, stretches between 0.75 and 1.8 times J^1/3, shear and rotation.
+inline Tensor random_deformation(Random &random, double J)
+{
+  const double a = random(0.75, 1.3), b = random(0.75, 1.3);
+  const Tensor stretch{a, 0, 0, 0, b, 0, 0, 0, 1 / (a * b)};
+  const Tensor shear{1, random(-0.3, 0.3), random(-0.3, 0.3), 0, 1, random(-0.3, 0.3), 0, 0, 1};
+  return std::cbrt(J) * (random_rotation(random) * (shear * stretch) * random_rotation(random));
+}
+
+inline PointState state_of_F(const Tensor &F, const Tensor &rate = {})
+{
+  PointState s;
+  const Tensor H = F - identity;
+  make_point_state(H.data(), rate.data(), s);
+  return s;
+}
+
+/// df/dx at 0 by the central five-point formula.
+inline double derivative(const std::function<double(double)> &f, double h)
+{
+  return (8 * (f(h) - f(-h)) - (f(2 * h) - f(-2 * h))) / (12 * h);
+}
+
+/// All five laws with the parameters of the paper, in the order CM1 ... CM5.
+inline std::vector<std::unique_ptr<TissueLaw>> five_laws()
+{
+  auto laws = Registry::standard().make_tissue_laws();
+  std::sort(laws.begin(), laws.end(),
+            [](const auto &a, const auto &b) { return std::string(a->alias()) < b->alias(); });
+  return laws;
+}
+
+/// Free inflation, F = J^1/3 I: p = dW/dJ (kPa) of CM1 ... CM5 (law = 1 ... 5) with the paper's parameters.
+inline double inflation_pressure(int law, double J)
+{
+  const double s = std::pow(J, 2. / 3), t = std::pow(J, -1. / 3);
+  switch (law) {
+  case 1: {
+    const double mu = 0.2808, lambda = 0.4212, phi0 = 0.99;
+    return mu * t + lambda / 2 * J - (mu + lambda / 2) / (J - 1 + phi0);
+  }
+  case 2: {
+    const double a = 0.43, b = -0.6, c = 2, g = 3 * (3 * a + b) / 4;
+    return c * std::exp(g * (s - 1) * (s - 1)) * 2 * g * (s - 1) * 2 / 3 * t;
+  }
+  case 3: {
+    const double c = 0.3567, beta = 1.075, c3 = 5.766e-3;
+    return 2 * c * t - 2 * c * std::pow(J, -2 * beta - 1) + 4 * c3 * std::pow(s - 1, 5) * t;
+  }
+  case 4: {
+    const double c = 1.298, beta = 0.75;
+    return 2 * c * t - 2 * c * std::pow(J, -2 * beta - 1);
+  }
+  default:
+    return 16.5 / 2 * (J - 1 / J);
+  }
+}
+
+/// Root of an increasing function between @p low and @p high.
+inline double root(const std::function<double(double)> &f, double low, double high)
+{
+  for (int i = 0; i < 200; ++i) {
+    const double middle = (low + high) / 2;
+    (f(middle) < 0 ? low : high) = middle;
+  }
+  return (low + high) / 2;
+}
+
+/// J of free inflation at pressure @p p (kPa), on the branch that starts at J = 1.
+inline double inflation_J(int law, double p)
+{
+  return root([&](double J) { return inflation_pressure(law, J) - p; }, 0.9, law == 4 ? 2.5 : 6);
+}
+
+} // namespace pulmo::test
