@@ -1,0 +1,111 @@
+"""Runs the program for the case tests and reads what it leaves.
+
+A test script is called with the program and the launcher: SCRIPT PULMO [MPIEXEC ARGUMENTS... -n].
+By hand: tests/cases/output_test.py build/pulmo
+"""
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import unittest
+
+import numpy as np
+
+SOURCE = os.environ.get("PULMO_SOURCE_DIR", os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))))
+PROGRAM, LAUNCHER = None, ["mpiexec", "--oversubscribe", "-n"]
+KPA_PER_CMH2O = 0.0980665
+_scratch = tempfile.TemporaryDirectory(prefix="pulmo_case_")
+
+ENVIRONMENT = dict(os.environ, OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1", OMPI_ALLOW_RUN_AS_ROOT="1",
+                   OMPI_ALLOW_RUN_AS_ROOT_CONFIRM="1",
+                   # several tests share the cores
+                   OMPI_MCA_hwloc_base_binding_policy="none", OMPI_MCA_mpi_yield_when_idle="1")
+
+
+def mesh(name):
+    return os.path.join(SOURCE, "meshes", name)
+
+
+def options_file(name):
+    return ["-options_file", os.path.join(SOURCE, "petsc_options", name)]
+
+
+TIGHT = options_file("solvers/tight.opts")
+DIRECT = options_file("solvers/direct.opts")
+PCV = options_file("scenes/pcv.opts")
+CUBE = ["-dm_plex_filename", mesh("cube_lung.msh"), "-mesh_scale", "1"]
+LUNG = ["-dm_plex_filename", mesh("lung_test.msh")]
+
+
+def scratch(name=""):
+    """A path that does not exist yet, in a folder that goes away with the test."""
+    return os.path.join(tempfile.mkdtemp(dir=_scratch.name), name or "run")
+
+
+class Case:
+    """One run of the program: exit code, what it said, what it left."""
+
+    def __init__(self, options, ranks=1, directory=None, timeout=300, launch=False):
+        self.directory = directory or scratch()
+        command = [PROGRAM] + [str(o) for o in options]
+        if self.directory != "-":  # "-": the options tell
+            command += ["-output_dir", self.directory]
+        if ranks > 1 or launch:
+            command = LAUNCHER + [str(ranks)] + command
+        self.command = " ".join(command)
+        start = time.monotonic()
+        process = subprocess.Popen(command, cwd=SOURCE, env=ENVIRONMENT, text=True, stdout=subprocess.PIPE,
+                                   stderr=subprocess.PIPE, start_new_session=True)
+        try:
+            self.out, self.err = process.communicate(timeout=timeout)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            self.out, self.err = process.communicate()
+            raise AssertionError(f"no end after {timeout} s: {self.command}\n{self.tail()}") from None
+        self.seconds = time.monotonic() - start
+        self.code = process.returncode
+
+    def tail(self):
+        return f"stdout: ...{self.out[-1500:]}\nstderr: {self.err[-3000:]}"
+
+    def path(self, name):
+        return os.path.join(self.directory, name)
+
+    def files(self):
+        return sorted(os.listdir(self.directory)) if os.path.isdir(self.directory) else []
+
+    def columns(self, name="signals.csv"):
+        with open(self.path(name), newline="") as f:
+            return next(csv.reader(f))
+
+    def signals(self, name="signals.csv"):
+        """Column -> array; the phase as a list of names."""
+        with open(self.path(name), newline="") as f:
+            rows = list(csv.DictReader(f))
+        return {c: [r[c] for r in rows] if c == "phase" else np.array([float(r[c]) for r in rows]) for c in rows[0]}
+
+    def json(self, name="summary.json"):
+        with open(self.path(name)) as f:
+            return json.load(f)
+
+
+def finished(options, **arguments):
+    """A run that has to reach its end."""
+    case = Case(options, **arguments)
+    if case.code != 0:
+        raise AssertionError(f"exit code {case.code}: {case.command}\n{case.tail()}")
+    return case
+
+
+def main():
+    """Takes the program and the launcher from the command line and runs the tests of the script."""
+    global PROGRAM, LAUNCHER
+    if len(sys.argv) < 2 or not os.path.exists(sys.argv[1]):
+        sys.exit(f"usage: {sys.argv[0]} PULMO [MPIEXEC ARGUMENTS... -n]")
+    PROGRAM = os.path.abspath(sys.argv[1])
+    LAUNCHER = sys.argv[2:] or LAUNCHER
+    unittest.main(module="__main__", argv=sys.argv[:1], verbosity=2)
