@@ -91,7 +91,7 @@ def bad_inputs():
         ("truncated mesh", GOOD + on(file_with("half.msh", half[:len(half) // 2], "wb")), ["half.msh", "not a readable mesh"]),
         ("mesh without names", GOOD + on(file_with("nameless.msh", cube_without_names())), ["nameless.msh", "surface"]),
         ("flat mesh", GOOD + on(file_with("flat.msh", flat_mesh())), ["flat.msh", "volume"]),
-        ("quadratic mesh", GOOD + on(quadratic_cube()), ["quadratic.msh"]),
+        ("quadratic mesh", GOOD + on(quadratic_cube()), ["quadratic.msh", "-order 1"]),
         ("inverted cell", GOOD + on(file_with("inverted.msh", inverted_cube())), ["inverted.msh", "1 inverted", "mm"]),
         ("no airway in the mesh", GOOD + on(pulmo.mesh("cube.msh")), ["'airway'", "-airflow_surfaces", "x0"]),
         ("unknown surface", GOOD + ["-chest_wall_surfaces", "plura"], ["'plura'", "-chest_wall_surfaces", "pleura"]),
