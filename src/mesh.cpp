@@ -143,7 +143,7 @@ PetscErrorCode Mesh::check_cells(const Options &options)
       ++foreign;
       continue;
     }
-    bool linear;
+    bool linear = true;
     PetscCall(cell_corners(dm_, c, x, linear));
     if (!linear) ++curved;
     for (int i = 0; i < 4; ++i)
