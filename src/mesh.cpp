@@ -136,7 +136,7 @@ PetscErrorCode Mesh::check_cells(const Options &options)
   PetscCall(DMPlexGetHeightStratum(dm_, 0, &begin, &end));
   for (PetscInt c = begin; c < end; ++c) {
     DMPolytopeType type;
-    PetscScalar x[12];
+    PetscScalar x[12] = {0};
     PetscReal J[9], longest = 0;
     PetscCall(DMPlexGetCellType(dm_, c, &type));
     if (type != DM_POLYTOPE_TETRAHEDRON) {
