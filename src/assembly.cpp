@@ -244,10 +244,11 @@ PetscErrorCode Assembly::for_blocks(Part part, Vec x, Vec x_t, PetscInt result_s
     for (PetscInt i = 0; i < n; ++i) gather(i, begin + i);
     std::fill(results.begin(), results.end(), 0.0);
     log_.timing = block % timed_share == 0;
+    if (log_.timing) log_.timed_cells += n;
     PetscCall(on_cells(n, &geom, u.data(), u_t.data(), results.data()));
     for (PetscInt i = 0; i < n; ++i) PetscCall(scatter(begin + i, &results[i * result_size]));
   }
-  log_.timing = false;
+  log_.timing = true;
   for (const Facets *facets : facets_) {
     const auto total = static_cast<PetscInt>(facets->cells.size());
     for (PetscInt begin = 0; begin < total; begin += block_cells) {
@@ -261,6 +262,7 @@ PetscErrorCode Assembly::for_blocks(Part part, Vec x, Vec x_t, PetscInt result_s
       for (PetscInt i = 0; i < n; ++i) PetscCall(scatter(facets->cells[begin + i], &results[i * result_size]));
     }
   }
+  log_.timing = false;
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

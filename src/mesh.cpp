@@ -47,8 +47,8 @@ PetscErrorCode check_file(MPI_Comm comm, const std::string &file)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-/// Corner coordinates (4 x 3, mm) of a local tetrahedron.
-PetscErrorCode cell_corners(DM dm, PetscInt cell, PetscScalar x[12])
+/// Corner coordinates (4 x 3, mm) of a local tetrahedron; not @p linear if it has more nodes than corners.
+PetscErrorCode cell_corners(DM dm, PetscInt cell, PetscScalar x[12], bool &linear)
 {
   Vec coordinates;
   PetscSection section;
@@ -60,6 +60,7 @@ PetscErrorCode cell_corners(DM dm, PetscInt cell, PetscScalar x[12])
   PetscCall(DMGetCoordinateSection(dm, &section));
   PetscCall(DMPlexVecGetClosure(dm, section, coordinates, cell, &n, &values));
   for (PetscInt i = 0; i < 12; ++i) x[i] = i < n ? values[i] : 0;
+  linear = n == 12;
   PetscCall(DMPlexVecRestoreClosure(dm, section, coordinates, cell, &n, &values));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -126,7 +127,7 @@ PetscErrorCode Mesh::check_cells(const Options &options)
     int rank;
   } worst{1, 0}, global;
   PetscReal volume = 0, centre[3] = {0, 0, 0};
-  PetscInt bad = 0, foreign = 0;
+  PetscInt bad = 0, foreign = 0, curved = 0;
   PetscMPIInt rank;
 
   PetscFunctionBeginUser;
@@ -135,14 +136,16 @@ PetscErrorCode Mesh::check_cells(const Options &options)
   PetscCall(DMPlexGetHeightStratum(dm_, 0, &begin, &end));
   for (PetscInt c = begin; c < end; ++c) {
     DMPolytopeType type;
-    PetscScalar x[12];
+    PetscScalar x[12] = {0};
     PetscReal J[9], longest = 0;
     PetscCall(DMPlexGetCellType(dm_, c, &type));
     if (type != DM_POLYTOPE_TETRAHEDRON) {
       ++foreign;
       continue;
     }
-    PetscCall(cell_corners(dm_, c, x));
+    bool linear = true;
+    PetscCall(cell_corners(dm_, c, x, linear));
+    if (!linear) ++curved;
     for (int i = 0; i < 4; ++i)
       for (int j = 0; j < i; ++j)
         longest = std::max(longest,
@@ -160,8 +163,8 @@ PetscErrorCode Mesh::check_cells(const Options &options)
       for (int d = 0; d < 3; ++d) centre[d] = (x[d] + x[3 + d] + x[6 + d] + x[9 + d]) / 4;
     }
   }
-  PetscInt counts[3] = {end - begin, bad, foreign};
-  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, counts, 3, MPIU_INT, MPI_SUM, comm));
+  PetscInt counts[4] = {end - begin, bad, foreign, curved};
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, counts, 4, MPIU_INT, MPI_SUM, comm));
   PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &volume, 1, MPIU_REAL, MPI_SUM, comm));
   PetscCallMPI(MPI_Allreduce(&worst, &global, 1, MPI_DOUBLE_INT, MPI_MINLOC, comm));
   PetscCallMPI(MPI_Bcast(centre, 3, MPIU_REAL, global.rank, comm));
@@ -171,6 +174,9 @@ PetscErrorCode Mesh::check_cells(const Options &options)
   PulmoUserCheck(counts[2] == 0, comm,
                  "-dm_plex_filename %s holds %d cells that are not tetrahedra; mesh with tetrahedra only",
                  file_.c_str(), static_cast<int>(counts[2]));
+  PulmoUserCheck(counts[3] == 0, comm,
+                 "-dm_plex_filename %s holds elements of higher order; save it with straight ones (gmsh -order 1)",
+                 file_.c_str());
   PulmoUserCheck(counts[1] == 0, comm,
                  "-dm_plex_filename %s holds %d inverted or degenerate cells, the worst at (%.6g, %.6g, %.6g) mm with "
                  "volume / (longest edge)^3 = %.2g; mesh anew or optimise the mesh in gmsh",

@@ -437,11 +437,13 @@ std::string Simulation::failure_text() const
     text << " The tissue turned inside out: J = " << inverted->measures.min_J << " in the cell at ("
          << inverted->measures.where[0] << ", " << inverted->measures.where[1] << ", " << inverted->measures.where[2]
          << ") mm (cell " << inverted->measures.cell << " of rank " << inverted->measures.rank << ").";
-  text << " Tried:";
-  for (const FailedAttempt &f : failures_)
-    text << " dt " << f.dt << " s: " << f.reason << (f.inverted ? " (J <= 0 met)" : "") << " after " << f.newton
-         << " Newton steps;";
-  text << " what to try: ";
+  text << " Tried";
+  for (const FailedAttempt &f : failures_) {
+    text << (&f == &failures_.front() ? " " : ", ") << "dt " << f.dt << " s (" << f.reason;
+    if (f.newton > 0) text << " after " << f.newton << " Newton steps" << (f.inverted ? ", J <= 0 on the way" : "");
+    text << ")";
+  }
+  text << ". What to try: ";
   if (inverted != failures_.rend())
     text << "-lumen_pressure if that cell is at the airway, a finer mesh there, a slower -ventilator_ramp, another "
             "-tissue; the law may have no equilibrium at this pressure.";

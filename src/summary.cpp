@@ -150,18 +150,25 @@ PetscErrorCode print_ledger(MPI_Comm comm, const Scene &scene, const Model &mode
   double timed = 0;
 
   PetscFunctionBeginUser;
-  // seconds of the timed blocks, scaled up; callbacks of several terms count for the first that registered them
-  const auto charge = [&](void (*callback)(void), const std::string &effect) {
-    const auto entry = callback ? log.seconds.find(callback) : log.seconds.end();
-    if (entry != log.seconds.end()) spent[effect] += entry->second * (double)Assembly::timed_share;
+  auto left = log.seconds;
+  // what was timed, scaled up; a callback of several terms counts for the first that registered it
+  const double scale =
+      log.timed_cells > 0 ? (double)(log.residual_cells + log.jacobian_cells) / (double)log.timed_cells : 0;
+  const auto charge = [&](auto callback, const std::string &effect, double factor) {
+    const auto entry = left.find(reinterpret_cast<void (*)(void)>(callback));
+    if (!callback || entry == left.end()) return;
+    spent[effect] += entry->second * factor;
+    left.erase(entry);
   };
   for (const Term &t : composition.terms()) {
-    for (auto f : {t.f0, t.f1}) charge(reinterpret_cast<void (*)(void)>(f), t.effect);
-    for (auto g : {t.g0, t.g1, t.g2, t.g3}) charge(reinterpret_cast<void (*)(void)>(g), t.effect);
+    for (auto f : {t.f0, t.f1}) charge(f, t.effect, scale);
+    for (auto g : {t.g0, t.g1, t.g2, t.g3}) charge(g, t.effect, scale);
+    for (auto f : {t.bd_f0, t.bd_f1}) charge(f, t.effect, 1);
+    for (auto g : {t.bd_g0, t.bd_g1, t.bd_g2, t.bd_g3}) charge(g, t.effect, 1);
   }
   for (const auto &[effect, s] : spent) timed += s;
   PetscCall(PetscPrintf(
-      comm, "\nEffects of this scene (seconds of its volume terms: one block in %d timed)\n%-16s %-22s %-9s %s\n",
+      comm, "\nEffects of this scene (seconds in its terms; one block of cells in %d is timed)\n%-16s %-22s %-9s %s\n",
       (int)Assembly::timed_share, "effect", "fields", "seconds", "share of run, terms, blocks"));
   for (const Effect *effect : scene.active()) {
     const std::string name = effect->name();

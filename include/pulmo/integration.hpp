@@ -25,7 +25,8 @@ struct IntegrationLog {
   long long residual_cells = 0; ///< cells in those residuals
   long long jacobian_calls = 0; ///< the same for Jacobians
   long long jacobian_cells = 0;
-  std::map<void (*)(void), double> seconds; ///< of each callback, in the blocks that were timed
+  long long timed_cells = 0;                ///< cells of the timed blocks, of residuals and Jacobians
+  std::map<void (*)(void), double> seconds; ///< of each callback in what was timed: some blocks of cells, all facets
 
   /// Makes @p log known to the integrator of @p ds.
   static PetscErrorCode attach(PetscDS ds, IntegrationLog *log);

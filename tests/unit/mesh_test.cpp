@@ -1,0 +1,86 @@
+// The mesh of a scene: every flavour of MSH that is read, two bodies, refinement, scaling, pins.
+#include "support/scene.hpp"
+
+#include <cmath>
+
+namespace pulmo::test {
+namespace {
+
+/// Reads one mesh as a scene does.
+PetscErrorCode read(Mesh &mesh, const std::string &file, const std::string &more = "")
+{
+  Options options(PETSC_COMM_WORLD);
+
+  PetscFunctionBeginUser;
+  PetscCall(set_options("-dm_plex_filename " + source("meshes/" + file) + " " + more));
+  PetscCall(mesh.declare(options));
+  PetscCall(mesh.read(options, false));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+class Flavour : public ::testing::TestWithParam<const char *> {};
+
+TEST_P(Flavour, IsTheSameCube)
+{
+  Mesh mesh;
+  PULMO_OK(read(mesh, GetParam()));
+  EXPECT_EQ(mesh.cells(), 24);
+  EXPECT_NEAR(mesh.volume(), 1, 1e-12);
+  ASSERT_EQ(mesh.surfaces().size(), 2u);
+  EXPECT_NEAR(mesh.surface("airway").area, 1, 1e-12);
+  EXPECT_NEAR(mesh.surface("pleura").area, 5, 1e-12);
+}
+
+INSTANTIATE_TEST_SUITE_P(Msh, Flavour,
+                         ::testing::Values("cube_msh22_ascii.msh", "cube_msh22_binary.msh", "cube_msh41_ascii.msh",
+                                           "cube_msh41_binary.msh"));
+
+TEST(Mesh, RefinementKeepsVolumeAndSurfaces)
+{
+  Mesh mesh;
+  PULMO_OK(read(mesh, "cube_msh41_binary.msh", "-dm_refine 1"));
+  EXPECT_EQ(mesh.cells(), 8 * 24);
+  EXPECT_NEAR(mesh.volume(), 1, 1e-12);
+  EXPECT_NEAR(mesh.surface("airway").area, 1, 1e-12);
+  EXPECT_NEAR(mesh.surface("pleura").area, 5, 1e-12);
+}
+
+TEST(Mesh, ScaleMultipliesTheCoordinates)
+{
+  Mesh mesh;
+  PULMO_OK(read(mesh, "cube_msh22_ascii.msh", "-mesh_scale 1000"));
+  EXPECT_NEAR(mesh.volume(), 1e9, 1);
+  EXPECT_NEAR(mesh.surface("pleura").area, 5e6, 1e-3);
+  EXPECT_NEAR(mesh.length(), 1000 / std::cbrt(24.), 1e-6);
+}
+
+TEST(Mesh, TwoLungsAreOneMesh)
+{
+  Mesh mesh;
+  PULMO_OK(read(mesh, "lung_pair.msh"));
+  EXPECT_EQ(mesh.cells(), 11623);
+  EXPECT_NEAR(mesh.volume(), 2500e3, 1); // exact by tools/lung_mesh's scaling
+  EXPECT_EQ(mesh.surfaces().size(), 2u);
+}
+
+TEST(Mesh, PinsFollowAxes)
+{
+  Mesh mesh;
+  std::array<Mesh::Pin, 3> pins;
+  PULMO_OK(read(mesh, "cube.msh"));
+  PULMO_OK(mesh.rigid_pins(pins));
+  // the cube has corners along its axes: none of the pins turns it when it swells about the first
+  for (int k = 1; k < 3; ++k)
+    for (int d = 0; d < 3; ++d) {
+      if (pins[k].component[d]) {
+        EXPECT_NEAR(pins[k].x[d], pins[0].x[d], 1e-12) << "pin " << k << " component " << d;
+      }
+    }
+  int held = 0;
+  for (const Mesh::Pin &pin : pins)
+    for (bool component : pin.component) held += component;
+  EXPECT_EQ(held, 6);
+}
+
+} // namespace
+} // namespace pulmo::test
