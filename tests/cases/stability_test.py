@@ -1,0 +1,112 @@
+#!/usr/bin/python3
+"""A run never passes a state that is turned inside out: it gets past by smaller steps, or it stops and says why."""
+import unittest
+
+import numpy as np
+
+import pulmo_case as pulmo
+
+QUIET = ["-progress", "off"]
+BERGER = pulmo.DIRECT + pulmo.PCV + QUIET + ["-tissue", "berger"]
+
+
+class Stability(unittest.TestCase):
+    def expect_stopped(self, case, *words):
+        """Stopped with one clear sentence, the signals so far and the last good state; nothing looks finished."""
+        self.assertNotIn(case.code, (0, None), case.tail())
+        self.assertEqual(case.err.count("pulmo: error:"), 1, case.err)
+        self.assertNotIn("PETSC ERROR", case.err)
+        for word in ("no step could be accepted after t =", "Tried dt ", "What to try: ", case.directory) + words:
+            self.assertIn(word, case.err)
+        files = case.files()
+        for name in ("failure.json", "signals.csv.part", "fields.xdmf"):
+            self.assertIn(name, files)
+        for name in ("summary.json", "signals.csv"):
+            self.assertNotIn(name, files)
+        failure = case.json("failure.json")
+        self.assertIs(failure["finished"], False)
+        self.assertIn(failure["failure"], case.err)
+        self.assert_sound(case, "signals.csv.part", "failure.json")
+        self.assertGreater(failure["rejected_steps"], 0)
+
+    def assert_sound(self, case, signals, summary):
+        """No accepted row with J <= 0 or a number that is none."""
+        rows = case.signals(signals)
+        self.assertGreater(rows["min_J"].min(), 0)
+        np.testing.assert_allclose(case.json(summary)["min_jacobian"], rows["min_J"].min(), rtol=1e-9)
+        for name, column in rows.items():
+            if name != "phase":
+                self.assertTrue(np.isfinite(column).all(), name)
+
+    def test_berger_on_the_lung_with_the_papers_traction(self):
+        case = pulmo.Case(BERGER + pulmo.LUNG + ["-ts_max_time", "0.3"])
+        if case.code == 0:
+            self.assertNotIn("failure.json", case.files())
+            self.assert_sound(case, "signals.csv", "summary.json")
+        else:
+            self.expect_stopped(case, "berger")
+
+    def test_berger_on_the_lung_with_lumen_pressure_runs_through(self):
+        case = pulmo.finished(BERGER + pulmo.LUNG + ["-lumen_pressure", "-ts_max_time", "0.3"])
+        self.assert_sound(case, "signals.csv", "summary.json")
+        self.assertAlmostEqual(case.signals()["time_s"][-1], 0.3)
+
+    def test_newton_that_converges_to_an_inside_out_state_is_not_believed(self):
+        """The airway's rim folds; at the last steps Newton converges, but to J < 0."""
+        for ranks in (1, 2):
+            with self.subTest(ranks=ranks):
+                case = pulmo.Case(BERGER + pulmo.CUBE + ["-ventilator_pip", "40", "-airflow_permeability", "10",
+                                                         "-ts_max_time", "0.3"], ranks=ranks)
+                self.expect_stopped(case, "converged to a state with J <= 0", "The tissue turned inside out: J = -",
+                                    "-lumen_pressure", "berger")
+                self.assertLess(case.signals("signals.csv.part")["time_s"][-1], 0.1)
+
+    def test_berger_on_the_lung_at_high_pressure(self):
+        case = pulmo.Case(BERGER + pulmo.LUNG + ["-ventilator_pip", "20", "-ts_adapt_dt_min", "1e-3",
+                                                 "-ts_max_time", "0.3"])
+        self.expect_stopped(case, "The tissue turned inside out: J = -")
+
+    def test_no_equilibrium_above_the_limit_point(self):
+        """Unrestrained CM4 has a limit point at 16.83 cmH2O with J = 2.534 (docs: loss of ellipticity)."""
+        options = pulmo.DIRECT + pulmo.CUBE + QUIET + [
+            "-tissue", "yoshihara", "-ventilator", "pcv", "-ventilator_ramp", "1", "-support", "-support_rigid"]
+        case = pulmo.Case(options + ["-ventilator_pip", "20"])
+        self.expect_stopped(case, "the law may have no equilibrium at this pressure", "yoshihara")
+        last = {name: column[-1] for name, column in case.signals("signals.csv.part").items()}
+        self.assertLess(last["airway_pressure_cmH2O"], 16.8275)
+        self.assertGreater(last["airway_pressure_cmH2O"], 16.80)
+        self.assertLess(last["min_J"], 2.534)
+        self.assertGreater(last["min_J"], 2.4)
+        below = pulmo.finished(options + ["-ventilator_pip", "16.7", "-ts_max_time", "1"])
+        self.assert_sound(below, "signals.csv", "summary.json")
+        # J of the homogeneous state: p = 2 c (J^-1/3 - J^(-2 beta - 1)), c 1.298 kPa, beta 0.75, by bisection
+        low, high = 1.0, 2.534
+        for _ in range(60):
+            J = (low + high) / 2
+            p = 2 * 1.298 * (J ** (-1 / 3) - J ** -2.5)
+            low, high = (J, high) if p < 16.7 * pulmo.KPA_PER_CMH2O else (low, J)
+        self.assertAlmostEqual(below.signals()["min_J"][-1], J, places=5)
+        self.assertAlmostEqual(below.signals()["max_J"][-1], J, places=5)
+
+    def test_steps_are_cut_and_grow_back(self):
+        """The whole pressure in the first step is too much for the default step; later the step asked for returns."""
+        for options in (["-tissue", "rausch", "-ventilator_pip", "40", "-ventilator_ramp", "0"],
+                        ["-tissue", "berger", "-ventilator_pip", "20"]):
+            with self.subTest(options=" ".join(options)):
+                case = pulmo.finished(pulmo.DIRECT + pulmo.PCV + pulmo.CUBE + QUIET + options + ["-ts_max_time", "0.3"])
+                self.assert_sound(case, "signals.csv", "summary.json")
+                rows, summary = case.signals(), case.json()
+                dt, time = rows["dt_s"][1:], rows["time_s"]
+                self.assertGreater(summary["rejected_steps"], 0)
+                self.assertLess(dt[0], 0.05 * (1 - 1e-9))
+                self.assertAlmostEqual(dt[-1], 0.05, places=9)
+                self.assertLess(dt.max(), 0.05 * (1 + 1e-9))
+                grown = dt[1:] / dt[:-1]
+                self.assertLess(grown.max(), 2 + 1e-6, "a step grows at most twofold")
+                np.testing.assert_allclose(np.diff(time), dt, rtol=1e-9)
+                self.assertEqual(summary["steps"], len(dt))
+                self.assertAlmostEqual(time[-1], 0.3)
+
+
+if __name__ == "__main__":
+    pulmo.main()
