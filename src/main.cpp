@@ -9,23 +9,31 @@
 #include "pulmo/pulmo.hpp"
 
 #include <cstdio>
-#include <cstring>
+#include <fstream>
+#include <sstream>
+#include <string>
+#include <vector>
 
 namespace {
 
-/// PETSc reports an unreadable -options_file with a stack trace; say it in a sentence before it starts.
-bool options_files_readable(int argc, char **argv)
+/// PETSc reports an unreadable -options_file with a stack trace; this finds the first one (also in the files that
+/// are read) so that it can be said in a sentence. Empty if all can be read.
+std::string unreadable_options_file(const std::vector<std::string> &words, int depth = 0)
 {
-  for (int i = 1; i + 1 < argc; ++i) {
-    if (std::strcmp(argv[i], "-options_file") != 0) continue;
-    std::FILE *f = std::fopen(argv[i + 1], "r");
-    if (!f) {
-      std::fprintf(stderr, "pulmo: error: -options_file %s cannot be read; check its name\n", argv[i + 1]);
-      return false;
+  constexpr int deepest = 16; // files that ask for one another without end
+  for (std::size_t i = 0; i + 1 < words.size(); ++i) {
+    if (words[i] != "-options_file") continue;
+    std::ifstream file(words[i + 1]);
+    if (!file || depth == deepest) return words[i + 1];
+    std::vector<std::string> inside;
+    for (std::string line; std::getline(file, line);) {
+      std::istringstream stream(line.substr(0, line.find('#')));
+      for (std::string word; stream >> word;) inside.push_back(word);
     }
-    std::fclose(f);
+    const std::string lost = unreadable_options_file(inside, depth + 1);
+    if (!lost.empty()) return lost;
   }
-  return true;
+  return "";
 }
 
 } // namespace
@@ -33,12 +41,22 @@ bool options_files_readable(int argc, char **argv)
 int main(int argc, char **argv)
 {
   bool finished = false;
+  int rank;
 
-  if (!options_files_readable(argc, argv)) return 1;
-  if (PetscInitialize(&argc, &argv, nullptr, "pulmo: whole-lung poromechanics\n") != 0) return 1;
-  PetscErrorCode code = pulmo::initialize();
+  if (MPI_Init(&argc, &argv) != MPI_SUCCESS) return 1;
+  MPI_Comm_rank(MPI_COMM_WORLD, &rank);
+  const std::string lost = unreadable_options_file({argv + 1, argv + argc});
+  if (!lost.empty()) {
+    if (rank == 0)
+      std::fprintf(stderr, "pulmo: error: -options_file %s cannot be read; check its name\n", lost.c_str());
+    MPI_Finalize();
+    return 1;
+  }
+  PetscErrorCode code = PetscInitialize(&argc, &argv, nullptr, "pulmo: whole-lung poromechanics\n");
+  if (code == 0) code = pulmo::initialize();
   if (code == 0) code = pulmo::run(pulmo::Registry::standard(), finished);
   if (code != 0 && code != PETSC_ERR_USER_INPUT) (void)MPI_Abort(PETSC_COMM_WORLD, 2); // maybe not on all ranks
-  if (PetscFinalize() != 0) return 1;
+  if (PetscFinalize() != 0) finished = false;
+  MPI_Finalize();
   return code == 0 && finished ? 0 : 1;
 }

@@ -10,17 +10,22 @@ namespace {
 PetscErrorCode handle_error(MPI_Comm comm, int line, const char *function, const char *file, PetscErrorCode code,
                             PetscErrorType type, const char *message, void *context)
 {
-  if (code != PETSC_ERR_USER_INPUT)
+  // -pc_type, -petscpartitioner_type, ... with a name that PETSc does not have: the user's to mend, too
+  const bool unknown_type = code == PETSC_ERR_ARG_UNKNOWN_TYPE;
+  if (code != PETSC_ERR_USER_INPUT && !unknown_type)
     return PetscTraceBackErrorHandler(comm, line, function, file, code, type, message, context);
   if (type == PETSC_ERROR_INITIAL) {
+    const std::string text = message ? message : "";
     PetscMPIInt rank = 0;
     (void)MPI_Comm_rank(comm, &rank);
     if (rank == 0) {
       std::fflush(stdout);
-      std::fprintf(stderr, "pulmo: error: %s\n", message);
+      std::fprintf(stderr, "pulmo: error: %s%s\n", text.substr(0, text.find('\n')).c_str(),
+                   unknown_type ? ": a PETSc option names a type that this PETSc does not have; check its spelling"
+                                : "");
     }
   }
-  return code;
+  return PETSC_ERR_USER_INPUT; // callers get what the handler returns
 }
 
 /// Tissue stiffness that scales the equations: the largest diagonal entry of dP'/dF at F = I, kPa.

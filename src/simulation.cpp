@@ -142,6 +142,7 @@ PetscErrorCode Simulation::create_solver()
   KSP ksp;
   PC pc;
   TSAdapt adapt;
+  PetscReal max_time;
   PetscBool is_beuler, has_pc, is_fieldsplit = PETSC_FALSE;
   char pc_type[64] = "";
 
@@ -182,6 +183,8 @@ PetscErrorCode Simulation::create_solver()
   PetscCall(TSSetFromOptions(ts_));
   PetscCall(TSGetTimeStep(ts_, &wanted_dt_));
   PulmoUserCheck(wanted_dt_ > 0, comm, "-ts_dt %g s must be positive", (double)wanted_dt_);
+  PetscCall(TSGetMaxTime(ts_, &max_time));
+  PulmoUserCheck(max_time > 0, comm, "-ts_max_time %g s leaves nothing to run; it must be positive", (double)max_time);
   PetscCall(PetscObjectTypeCompare((PetscObject)(TS)ts_, TSBEULER, &is_beuler));
   PulmoUserCheck(is_beuler, comm,
                  "-ts_type: the conservative rate of porosity is exact for backward Euler only; use -ts_type beuler");
