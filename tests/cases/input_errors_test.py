@@ -221,6 +221,8 @@ def table(m):
         "no solver file": (pulmo.PCV + ["-dm_plex_filename", m["good"]], ["petsc_options/solvers/direct.opts", "-pc_type"]),
         "time integrator": (good + ["-ts_type", "bdf"], ["-ts_type", "beuler"]),
         "step backwards": (good + ["-ts_dt", "-0.1"], ["-ts_dt", "positive"]),
+        "a word for a step": (good + ["-ts_dt", "short"], ["-ts_dt", "number", "short"]),
+        "a word for a number of PETSc's": (good + ["-snes_rtol", "tiny"], ["-snes_rtol", "number", "tiny"]),
         "no time": (good + ["-ts_max_time", "0"], ["-ts_max_time"]),
         "unknown solver type": (good + ["-pc_type", "lemon"], ["lemon"]),
         "unknown element type": (good + ["-petscfe_type", "cubist"], ["cubist"]),
