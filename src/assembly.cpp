@@ -461,7 +461,6 @@ PetscErrorCode Assembly::map_matrix(Mat A)
       }
     }
   }
-  PetscCall(MatRestoreRowIJ(m.diagonal, 0, PETSC_FALSE, PETSC_FALSE, &n_rows, nullptr, nullptr, &done));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -181,6 +181,7 @@ PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
   ViewerHandle viewer;
 
   PetscFunctionBeginUser;
+  if (!times_.empty() && times_.back() == time) PetscFunctionReturn(PETSC_SUCCESS);
   if (n_nodes_ < 0) PetscCall(write_mesh());
   const ReadArray x(local);
   PetscCall(DMGetLocalSection(dm, &section));

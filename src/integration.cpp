@@ -25,7 +25,7 @@ constexpr PetscInt max_components = 3;
 class Scratch {
 public:
   explicit Scratch(std::size_t n)
-      : data_(static_cast<PetscScalar *>(std::aligned_alloc(64, (n * sizeof(PetscScalar) + 127) / 64 * 64))), size_(n)
+      : data_(static_cast<PetscScalar *>(std::aligned_alloc(64, (n * sizeof(PetscScalar) + 127) / 64 * 64)))
   {
     if (!data_) throw std::bad_alloc();
     std::memset(data_, 0, n * sizeof(PetscScalar));
@@ -43,7 +43,7 @@ public:
 
 private:
   PetscScalar *data_;
-  std::size_t size_, used_ = 0;
+  std::size_t used_ = 0;
 };
 
 /// Four doubles that the compiler keeps in one vector register (or two, or four).

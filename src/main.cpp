@@ -9,6 +9,7 @@
 #include "pulmo/pulmo.hpp"
 
 #include <cstdio>
+#include <filesystem>
 #include <fstream>
 #include <sstream>
 #include <string>
@@ -24,7 +25,7 @@ std::string unreadable_options_file(const std::vector<std::string> &words, int d
   for (std::size_t i = 0; i + 1 < words.size(); ++i) {
     if (words[i] != "-options_file") continue;
     std::ifstream file(words[i + 1]);
-    if (!file || depth == deepest) return words[i + 1];
+    if (!file || std::filesystem::is_directory(words[i + 1]) || depth == deepest) return words[i + 1];
     std::vector<std::string> inside;
     for (std::string line; std::getline(file, line);) {
       std::istringstream stream(line.substr(0, line.find('#')));

@@ -3,6 +3,7 @@
 #include "pulmo/units.hpp"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstdio>
 
@@ -65,6 +66,78 @@ PetscErrorCode cell_corners(DM dm, PetscInt cell, PetscScalar x[12], bool &linea
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+/// Which mesh points other ranks have, too.
+PetscErrorCode find_shared_points(DM dm, PetscInt point_end, std::vector<char> &shared)
+{
+  PetscSF sf;
+  PetscInt roots, n_leaves;
+  const PetscInt *leaves, *degrees;
+
+  PetscFunctionBeginUser;
+  shared.assign(static_cast<std::size_t>(point_end), 0);
+  PetscCall(DMGetPointSF(dm, &sf));
+  PetscCall(PetscSFGetGraph(sf, &roots, &n_leaves, &leaves, nullptr));
+  if (roots < 0) PetscFunctionReturn(PETSC_SUCCESS); // one rank
+  PetscCall(PetscSFComputeDegreeBegin(sf, &degrees));
+  PetscCall(PetscSFComputeDegreeEnd(sf, &degrees));
+  for (PetscInt p = 0; p < roots; ++p)
+    if (degrees[p] > 0) shared[p] = 1;
+  for (PetscInt i = 0; i < n_leaves; ++i) shared[leaves ? leaves[i] : i] = 1;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// body[vertex - begin]: a number that all vertices of one connected body share, on all ranks.
+PetscErrorCode find_bodies(DM dm, PetscInt begin, PetscInt end, std::vector<PetscInt> &body)
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)dm);
+  PetscInt cell_begin, cell_end, point_end, roots, changed = 1;
+  PetscSF sf;
+  IS numbering;
+  const PetscInt *numbers;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMPlexGetChart(dm, nullptr, &point_end));
+  PetscCall(DMPlexGetHeightStratum(dm, 0, &cell_begin, &cell_end));
+  PetscCall(DMPlexGetVertexNumbering(dm, &numbering));
+  PetscCall(ISGetIndices(numbering, &numbers));
+  std::vector<PetscInt> of(static_cast<std::size_t>(point_end), PETSC_MAX_INT), sent;
+  for (PetscInt v = begin; v < end; ++v)
+    of[v] = numbers[v - begin] < 0 ? -(numbers[v - begin] + 1) : numbers[v - begin];
+  PetscCall(ISRestoreIndices(numbering, &numbers));
+  PetscCall(DMGetPointSF(dm, &sf));
+  PetscCall(PetscSFGetGraph(sf, &roots, nullptr, nullptr, nullptr));
+  while (changed) { // the least number spreads over cells, then over ranks
+    changed = 0;
+    for (bool sweep = true; sweep;) {
+      sweep = false;
+      for (PetscInt c = cell_begin; c < cell_end; ++c) {
+        PetscInt *closure = nullptr, n, least = PETSC_MAX_INT;
+        PetscCall(DMPlexGetTransitiveClosure(dm, c, PETSC_TRUE, &n, &closure));
+        for (PetscInt i = 0; i < n; ++i) least = std::min(least, of[closure[2 * i]]);
+        for (PetscInt i = 0; i < n; ++i) {
+          PetscInt &mine = of[closure[2 * i]];
+          if (closure[2 * i] < begin || closure[2 * i] >= end || mine == least) continue;
+          mine = least;
+          sweep = true;
+          changed = 1;
+        }
+        PetscCall(DMPlexRestoreTransitiveClosure(dm, c, PETSC_TRUE, &n, &closure));
+      }
+    }
+    if (roots >= 0) {
+      sent = of;
+      PetscCall(PetscSFReduceBegin(sf, MPIU_INT, sent.data(), of.data(), MPI_MIN));
+      PetscCall(PetscSFReduceEnd(sf, MPIU_INT, sent.data(), of.data(), MPI_MIN));
+      sent = of;
+      PetscCall(PetscSFBcastBegin(sf, MPIU_INT, sent.data(), of.data(), MPI_REPLACE));
+      PetscCall(PetscSFBcastEnd(sf, MPIU_INT, sent.data(), of.data(), MPI_REPLACE));
+    }
+    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &changed, 1, MPIU_INT, MPI_MAX, comm));
+  }
+  body.assign(of.begin() + begin, of.begin() + end);
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 } // namespace
 
 PetscErrorCode Mesh::declare(Options &options)
@@ -81,7 +154,7 @@ PetscErrorCode Mesh::read(const Options &options, bool ventilated)
   const MPI_Comm comm = options.comm();
   char name[PETSC_MAX_PATH_LEN] = "";
   PetscBool given;
-  PetscInt dim;
+  PetscInt dim, overlap;
   Vec coordinates;
 
   PetscFunctionBeginUser;
@@ -96,6 +169,9 @@ PetscErrorCode Mesh::read(const Options &options, bool ventilated)
   PetscCall(DMSetType(dm_, DMPLEX));
   PetscCall(DMSetFromOptions(dm_));
   PetscCall(DMViewFromOptions(dm_, nullptr, "-dm_view"));
+  PetscCall(DMPlexGetOverlap(dm_, &overlap));
+  PulmoUserCheck(overlap == 0, comm, "-dm_distribute_overlap %d: pulmo works without overlap; leave the option out",
+                 static_cast<int>(overlap));
   PetscCall(DMGetDimension(dm_, &dim));
   PulmoUserCheck(dim == 3, comm, "-dm_plex_filename %s holds no volume elements (dimension %d); mesh the volume", name,
                  static_cast<int>(dim));
@@ -189,17 +265,21 @@ PetscErrorCode Mesh::check_cells(const Options &options)
 PetscErrorCode Mesh::find_surfaces(const Options &options)
 {
   const MPI_Comm comm = options.comm();
-  PetscInt n, face_begin, face_end;
+  PetscInt n, point_end, face_begin, face_end;
+  std::vector<char> shared; // [mesh point]: also on another rank
 
   PetscFunctionBeginUser;
+  PetscCall(DMPlexGetChart(dm_, nullptr, &point_end));
   PetscCall(DMPlexGetHeightStratum(dm_, 1, &face_begin, &face_end));
+  PetscCall(find_shared_points(dm_, point_end, shared));
   PetscCall(DMGetNumLabels(dm_, &n));
   for (PetscInt l = 0; l < n; ++l) {
     const char *name;
     DMLabel label;
     ISHandle values_is;
     const PetscInt *values;
-    PetscInt n_values, value = -1, faces = 0, interior = 0;
+    PetscInt n_values, found[2] = {0, 0};                 // facets, facets inside the volume
+    PetscInt range[2] = {-PETSC_MAX_INT, -PETSC_MAX_INT}; // -(least), largest value that has facets
     PetscReal area = 0;
 
     PetscCall(DMGetLabelName(dm_, l, &name));
@@ -209,13 +289,11 @@ PetscErrorCode Mesh::find_surfaces(const Options &options)
     PetscCall(DMLabelGetValueIS(label, values_is.out()));
     PetscCall(ISGetLocalSize(values_is, &n_values));
     PetscCall(ISGetIndices(values_is, &values));
-    if (n_values > 0) value = values[0];
-    PetscCall(ISRestoreIndices(values_is, &values));
-    if (value >= 0) {
+    for (PetscInt v = 0; v < n_values; ++v) { // a name may be given to a surface and to a volume
       ISHandle points_is;
       const PetscInt *points;
       PetscInt n_points;
-      PetscCall(DMLabelGetStratumIS(label, value, points_is.out()));
+      PetscCall(DMLabelGetStratumIS(label, values[v], points_is.out()));
       PetscCall(ISGetLocalSize(points_is, &n_points));
       PetscCall(ISGetIndices(points_is, &points));
       for (PetscInt i = 0; i < n_points; ++i) {
@@ -224,19 +302,28 @@ PetscErrorCode Mesh::find_surfaces(const Options &options)
         if (points[i] < face_begin || points[i] >= face_end) continue;
         PetscCall(DMPlexGetSupportSize(dm_, points[i], &support));
         PetscCall(DMPlexComputeCellGeometryFVM(dm_, points[i], &a, nullptr, nullptr));
-        ++faces;
-        if (support > 1)
-          ++interior;
+        range[0] = std::max(range[0], -values[v]);
+        range[1] = std::max(range[1], values[v]);
+        ++found[0];
+        if (support > 1 || shared[points[i]])
+          ++found[1];
         else
           area += a;
       }
       PetscCall(ISRestoreIndices(points_is, &points));
     }
-    PetscInt found[2] = {faces, interior};
+    PetscCall(ISRestoreIndices(values_is, &values));
     PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, found, 2, MPIU_INT, MPI_SUM, comm));
-    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &value, 1, MPIU_INT, MPI_MAX, comm));
+    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, range, 2, MPIU_INT, MPI_MAX, comm));
     PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &area, 1, MPIU_REAL, MPI_SUM, comm));
-    if (found[0] > 0 && found[1] == 0) surfaces_[name] = {label, value, area};
+    if (found[0] == 0) continue;
+    PulmoUserCheck(-range[0] == range[1], comm,
+                   "the mesh %s gives the name '%s' to several groups of facets; join them into one in gmsh",
+                   file_.c_str(), name);
+    if (found[1] == 0)
+      surfaces_[name] = {label, range[1], area};
+    else
+      inside_.push_back(name);
   }
   PulmoUserCheck(!surfaces_.empty(), comm,
                  "the mesh %s names no surface; give its boundary physical names such as airway and pleura",
@@ -254,10 +341,15 @@ std::string Mesh::surface_names() const
 PetscErrorCode Mesh::require_surfaces(const std::vector<std::string> &names, const std::string &option) const
 {
   PetscFunctionBeginUser;
-  for (const std::string &name : names)
+  for (const std::string &name : names) {
+    PulmoUserCheck(std::find(inside_.begin(), inside_.end(), name) == inside_.end(),
+                   PetscObjectComm((PetscObject)(DM)dm_),
+                   "facets of '%s', which %s asks for, lie inside the volume of mesh %s; name its boundary only",
+                   name.c_str(), option.c_str(), file_.c_str());
     PulmoUserCheck(surfaces_.count(name), PetscObjectComm((PetscObject)(DM)dm_),
                    "the mesh %s has no surface '%s', which %s asks for; it has %s: name one of these", file_.c_str(),
                    name.c_str(), option.c_str(), surface_names().c_str());
+  }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -287,19 +379,42 @@ PetscErrorCode Mesh::node_coordinates(PetscInt point, PetscReal x[3]) const
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Mesh::rigid_pins(std::array<Pin, 3> &pins) const
+PetscErrorCode Mesh::rigid_pins(std::vector<Pin> &pins) const
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
+  PetscInt begin, end, last = -1;
+  std::vector<PetscInt> body;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMPlexGetDepthStratum(dm_, 0, &begin, &end));
+  PetscCall(find_bodies(dm_, begin, end, body));
+  pins.clear();
+  for (;;) { // bodies in the order of their numbers
+    PetscInt next = PETSC_MAX_INT;
+    std::vector<PetscInt> vertices;
+    for (PetscInt number : body)
+      if (number > last) next = std::min(next, number);
+    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &next, 1, MPIU_INT, MPI_MIN, comm));
+    if (next == PETSC_MAX_INT) break;
+    for (PetscInt v = begin; v < end; ++v)
+      if (body[v - begin] == next) vertices.push_back(v);
+    PetscCall(pin_body(vertices, pins));
+    last = next;
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Mesh::pin_body(const std::vector<PetscInt> &vertices, std::vector<Pin> &pins) const
 {
   using Coordinates = std::array<PetscReal, 3>;
   constexpr PetscReal off_axis = 3; // weight of what leads away from an axis
   const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
-  PetscInt begin, end;
   PetscMPIInt rank;
   std::array<Coordinates, 3> chosen{};
   int along = 2, across = 0; // the axis that AB is close to; the second axis of the plane that ABC is close to
 
   PetscFunctionBeginUser;
   PetscCallMPI(MPI_Comm_rank(comm, &rank));
-  PetscCall(DMPlexGetDepthStratum(dm_, 0, &begin, &end));
   // A: the lowest vertex. B: far from A and close to an axis through A. C: far from AB and close to a plane of two
   // axes through it. Then the held components hardly turn a lung that swells. Ranks that share a vertex have the same
   // coordinates for it, so the choice by coordinates is the same on all.
@@ -317,7 +432,7 @@ PetscErrorCode Mesh::rigid_pins(std::array<Pin, 3> &pins) const
       int rank;
     } best{-PETSC_MAX_REAL, rank}, winner;
     double found[4] = {0, 0, 0, 0}; // coordinates, axis
-    for (PetscInt v = begin; v < end; ++v) {
+    for (PetscInt v : vertices) {
       Coordinates x;
       PetscCall(node_coordinates(v, x.data()));
       for (int axis = 0; axis < 3; ++axis) {
@@ -335,17 +450,17 @@ PetscErrorCode Mesh::rigid_pins(std::array<Pin, 3> &pins) const
     if (k == 2) across = static_cast<int>(found[3]);
   }
   for (int k = 0; k < 3; ++k) {
-    Pin &pin = pins[k];
-    pin = Pin();
+    Pin pin;
     for (int d = 0; d < 3; ++d) {
       pin.x[d] = chosen[k][d];
       pin.component[d] = k == 0 || (k == 1 && d != along) || (k == 2 && d == 3 - along - across);
     }
-    for (PetscInt v = begin; v < end; ++v) {
+    for (PetscInt v : vertices) {
       Coordinates x;
       PetscCall(node_coordinates(v, x.data()));
       if (x == chosen[k]) pin.vertex = v;
     }
+    pins.push_back(pin);
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }

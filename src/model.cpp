@@ -144,11 +144,12 @@ PetscErrorCode Model::create_weak_form()
 /// constraint_of[4 * point + component]: which constraint holds that component there, or -1; pressure is component 3.
 PetscErrorCode Model::find_constraints(std::vector<PetscInt> &constraint_of)
 {
-  PetscInt begin, end;
+  PetscInt begin, end, face_begin, face_end;
   PetscSF sf;
 
   PetscFunctionBeginUser;
   PetscCall(DMPlexGetChart(dm_, &begin, &end));
+  PetscCall(DMPlexGetHeightStratum(dm_, 1, &face_begin, &face_end));
   constraint_of.assign(static_cast<std::size_t>(4 * end), -1);
   const auto &constraints = composition().constraints();
   for (std::size_t k = 0; k < constraints.size(); ++k) {
@@ -171,6 +172,7 @@ PetscErrorCode Model::find_constraints(std::vector<PetscInt> &constraint_of)
     PetscCall(ISGetIndices(stratum, &points));
     for (PetscInt i = 0; i < n; ++i) {
       PetscInt *closure = nullptr, n_closure;
+      if (points[i] < face_begin || points[i] >= face_end) continue;
       PetscCall(DMPlexGetTransitiveClosure(dm_, points[i], PETSC_TRUE, &n_closure, &closure));
       for (PetscInt j = 0; j < n_closure; ++j) hold(closure[2 * j]);
       PetscCall(DMPlexRestoreTransitiveClosure(dm_, points[i], PETSC_TRUE, &n_closure, &closure));

@@ -333,6 +333,9 @@ PetscErrorCode Options::warn_unused() const
   PetscCall(PetscOptionsLeftGet(nullptr, &n, &names, &values));
   for (PetscInt i = 0; i < n; ++i) {
     const std::string name = std::string("-") + names[i], guess = nearest(name);
+    const auto begins = [&](const char *prefix) { return name.rfind(prefix, 0) == 0; };
+    // solver files serve scenes of one and of two fields; -options_left is PETSc's own
+    if (begins("-options_left") || begins("-pc_fieldsplit_") || begins("-fieldsplit_")) continue;
     PetscCall(PetscPrintf(comm_, "pulmo: warning: option %s was not used%s\n", name.c_str(),
                           guess.empty() ? "" : ("; did you mean " + guess + "?").c_str()));
   }

@@ -11,8 +11,7 @@ namespace {
 /// METIS k-way partition of the dual graph. Only the rank that holds the mesh has vertices (as after reading a
 /// file); a graph that is spread over ranks is refused.
 PetscErrorCode partition_metis(PetscPartitioner partitioner, PetscInt n_parts, PetscInt n_vertices, PetscInt start[],
-                               PetscInt adjacency[], PetscSection vertex_section, PetscSection, PetscSection section,
-                               IS *partition)
+                               PetscInt adjacency[], PetscSection, PetscSection, PetscSection section, IS *partition)
 {
   const MPI_Comm comm = PetscObjectComm((PetscObject)partitioner);
   PetscInt holders = n_vertices > 0;
@@ -20,7 +19,6 @@ PetscErrorCode partition_metis(PetscPartitioner partitioner, PetscInt n_parts, P
   std::vector<idx_t> part(static_cast<std::size_t>(n_vertices), 0);
 
   PetscFunctionBeginUser;
-  (void)vertex_section;
   PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &holders, 1, MPIU_INT, MPI_SUM, comm));
   PulmoUserCheck(holders <= 1, comm,
                  "-petscpartitioner_type metis partitions a mesh that one rank holds; use ptscotch to partition anew");

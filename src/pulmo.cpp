@@ -11,18 +11,22 @@ PetscErrorCode handle_error(MPI_Comm comm, int line, const char *function, const
                             PetscErrorType type, const char *message, void *context)
 {
   // -pc_type, -petscpartitioner_type, ... with a name that PETSc does not have: the user's to mend, too
+  // and -ts_dt abc
+  const std::string text = message ? message : "";
   const bool unknown_type = code == PETSC_ERR_ARG_UNKNOWN_TYPE;
-  if (code != PETSC_ERR_USER_INPUT && !unknown_type)
+  const bool bad_value = text.rfind("Input string", 0) == 0;
+  if (code != PETSC_ERR_USER_INPUT && !unknown_type && !bad_value)
     return PetscTraceBackErrorHandler(comm, line, function, file, code, type, message, context);
   if (type == PETSC_ERROR_INITIAL) {
-    const std::string text = message ? message : "";
     PetscMPIInt rank = 0;
     (void)MPI_Comm_rank(comm, &rank);
     if (rank == 0) {
       std::fflush(stdout);
-      std::fprintf(stderr, "pulmo: error: %s%s\n", text.substr(0, text.find('\n')).c_str(),
-                   unknown_type ? ": a PETSc option names a type that this PETSc does not have; check its spelling"
-                                : "");
+      const char *mend = unknown_type
+                             ? ": a PETSc option names a type that this PETSc does not have; check its spelling"
+                         : bad_value ? ": a PETSc option has a value of the wrong kind; check it"
+                                     : "";
+      std::fprintf(stderr, "pulmo: error: %s%s\n", text.substr(0, text.find('\n')).c_str(), mend);
     }
   }
   return PETSC_ERR_USER_INPUT; // callers get what the handler returns

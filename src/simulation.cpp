@@ -14,6 +14,9 @@ namespace {
 /// Two times closer than this share of the step are the same.
 constexpr PetscReal same_time = 1e-9;
 
+/// A step may be longer by this share to land on a time, so that no sliver of a step is left.
+constexpr PetscReal stretch = 0.01;
+
 /// A step cut below this share of the one asked for ends the run (-ts_adapt_dt_min may end it earlier).
 constexpr PetscReal least_step = 1e-6;
 
@@ -47,9 +50,15 @@ PetscErrorCode ifunction(TS, PetscReal t, Vec X, Vec Xdot, Vec F, void *simulati
   return static_cast<Simulation *>(simulation)->residual(t, X, Xdot, F);
 }
 
-PetscErrorCode ijacobian(TS, PetscReal t, Vec X, Vec Xdot, PetscReal shift, Mat A, Mat, void *simulation)
+PetscErrorCode ijacobian(TS, PetscReal t, Vec X, Vec Xdot, PetscReal shift, Mat A, Mat P, void *simulation)
 {
-  return static_cast<Simulation *>(simulation)->jacobian(t, X, Xdot, shift, A);
+  PetscFunctionBeginUser;
+  PetscCall(static_cast<Simulation *>(simulation)->jacobian(t, X, Xdot, shift, P));
+  if (A != P) { // -snes_mf_operator
+    PetscCall(MatAssemblyBegin(A, MAT_FINAL_ASSEMBLY));
+    PetscCall(MatAssemblyEnd(A, MAT_FINAL_ASSEMBLY));
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
 }
 
 PetscErrorCode simulation_of(TS ts, Simulation **simulation)
@@ -143,7 +152,8 @@ PetscErrorCode Simulation::create_solver()
   PC pc;
   TSAdapt adapt;
   PetscReal max_time;
-  PetscBool is_beuler, has_pc, is_fieldsplit = PETSC_FALSE;
+  PetscInt max_steps;
+  PetscBool own_control, is_beuler, has_pc, is_fieldsplit = PETSC_FALSE;
   char pc_type[64] = "";
 
   PetscFunctionBeginUser;
@@ -184,6 +194,10 @@ PetscErrorCode Simulation::create_solver()
   PetscCall(TSGetTimeStep(ts_, &wanted_dt_));
   PulmoUserCheck(wanted_dt_ > 0, comm, "-ts_dt %g s must be positive", (double)wanted_dt_);
   PetscCall(TSGetMaxTime(ts_, &max_time));
+  PetscCall(TSGetMaxSteps(ts_, &max_steps));
+  PulmoUserCheck(max_steps == PETSC_MAX_INT, comm, "-ts_max_steps would cut a phase short; use -ts_max_time");
+  PetscCall(PetscObjectTypeCompare((PetscObject)adapt, "pulmo", &own_control));
+  PulmoUserCheck(own_control, comm, "-ts_adapt_type: pulmo cuts, regrows and lands steps itself; leave the option out");
   PulmoUserCheck(max_time > 0, comm, "-ts_max_time %g s leaves nothing to run; it must be positive", (double)max_time);
   PetscCall(PetscObjectTypeCompare((PetscObject)(TS)ts_, TSBEULER, &is_beuler));
   PulmoUserCheck(is_beuler, comm,
@@ -210,7 +224,7 @@ PetscReal Simulation::landing(PetscReal t) const
 {
   const PetscReal tolerance = same_time * wanted_dt_;
   for (const PetscReal stop : {phase_->begin + phase_->ramp, phase_->end})
-    if (t < stop - tolerance && t + dt_ > stop - tolerance) return stop - t;
+    if (t < stop - tolerance && t + (1 + stretch) * dt_ > stop) return stop - t;
   return dt_;
 }
 
@@ -377,7 +391,9 @@ PetscErrorCode Simulation::after_step()
   PetscCall(TSGetTime(ts_, &t));
   row.dt = t - accepted_.time;
   cut_ = false;
-  crawled_ = row.dt < crawling_step * wanted_dt_ && row.time != phase_->end ? crawled_ + 1 : 0;
+  const bool landed = std::abs(t - phase_->end) <= same_time * wanted_dt_ ||
+                      std::abs(t - phase_->begin - phase_->ramp) <= same_time * wanted_dt_;
+  crawled_ = row.dt < crawling_step * wanted_dt_ && !landed ? crawled_ + 1 : 0;
   if (crawled_ == 0) failures_.clear();
 
   // state and consistent flux of the accepted step
@@ -432,8 +448,9 @@ std::string Simulation::failure_text() const
 {
   std::ostringstream text;
   text.precision(6);
-  text << "no step could be accepted after t = " << accepted_.time << " s (phase " << (phase_ ? phase_->name : "run")
-       << ", airway pressure " << accepted_.pressure << " cmH2O, volume " << accepted_.volume << " ml, tissue law "
+  text << (crawled_ >= crawling_steps ? "steps only crawl at t = " : "no step could be accepted after t = ")
+       << accepted_.time << " s (phase " << (phase_ ? phase_->name : "run") << ", airway pressure "
+       << accepted_.pressure << " cmH2O, volume " << accepted_.volume << " ml, tissue law "
        << scene_.tissue().law().name() << ", smallest J " << accepted_.min_J << ").";
   const auto inverted = std::find_if(failures_.rbegin(), failures_.rend(), [](const auto &f) { return f.inverted; });
   if (inverted != failures_.rend())

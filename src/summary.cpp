@@ -100,7 +100,7 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
 
     const std::string part = file + ".part";
     std::ofstream f(part);
-    f << json.dump(2) << "\n";
+    f << json.dump(2, ' ', false, Json::error_handler_t::replace) << "\n";
     f.close();
     std::error_code error;
     if (f.good()) std::filesystem::rename(part, file, error);

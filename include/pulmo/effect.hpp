@@ -72,7 +72,6 @@ public:
   {
     fields_.push_back({name, components, degree, unit, effect_});
   }
-  bool has_pressure() const { return fields_.size() > static_cast<std::size_t>(pressure); }
 
   /// Hands a struct of parameters to the kernels. The struct must outlive the model.
   template <class P>
@@ -126,7 +125,8 @@ public:
     constraints_.push_back(std::move(c));
   }
 
-  /// Whether anything holds the lung in place: prescribed displacement, or a term that resists displacement itself.
+  /// Whether anything at all holds the lung: a prescribed displacement, or a term that resists displacement itself.
+  /// (It may still be too little to stop every rigid motion.)
   bool held() const
   {
     for (const Constraint &c : constraints_)

@@ -4,7 +4,6 @@
 
 #include "pulmo/options.hpp"
 
-#include <array>
 #include <map>
 
 namespace pulmo {
@@ -40,14 +39,15 @@ public:
 
   /// User error, naming @p option and the surfaces that exist, unless all @p names are surfaces of the mesh.
   PetscErrorCode require_surfaces(const std::vector<std::string> &names, const std::string &option) const;
-  /// Three vertices and 3, 2, 1 components that remove exactly the six rigid-body modes.
-  PetscErrorCode rigid_pins(std::array<Pin, 3> &pins) const;
+  /// Three vertices of each connected body and 3, 2, 1 components that remove exactly its six rigid-body modes.
+  PetscErrorCode rigid_pins(std::vector<Pin> &pins) const;
   /// Coordinates of a vertex or of the middle of an edge, mm.
   PetscErrorCode node_coordinates(PetscInt point, PetscReal x[3]) const;
 
 private:
   PetscErrorCode check_cells(const Options &options);
   PetscErrorCode find_surfaces(const Options &options);
+  PetscErrorCode pin_body(const std::vector<PetscInt> &vertices, std::vector<Pin> &pins) const;
   std::string surface_names() const;
 
   DMHandle dm_;
@@ -56,6 +56,7 @@ private:
   bool scale_given_ = false;
   PetscInt cells_ = 0;
   std::map<std::string, Surface> surfaces_;
+  std::vector<std::string> inside_; ///< names of facets inside the volume: no boundary
 };
 
 /// Makes `-petscpartitioner_type metis` known to PETSc (METIS k-way on the rank that holds the mesh).

@@ -1,7 +1,7 @@
 /// @file
 /// Permeability laws of the airflow effect: k(J) in mm^2/(kPa s), spatially isotropic (k = kappa / eta).
 ///
-/// A law is a struct with `name`, `uses` (one line), `Parameters` (owner "permeability"), `declare` and
+/// A law is a struct with `name`, `Parameters` (owner "permeability"), `declare` and
 /// `Value permeability(J, Parameters)`, and one line in src/registry.cpp.
 #pragma once
 

@@ -101,15 +101,6 @@ public:
     reset();
     return &object_;
   }
-  /// The place of the object that is held, for functions that change it in place.
-  T *inout() { return &object_; }
-  /// Shares an object that someone else owns too (PETSc counts references).
-  void share(T object)
-  {
-    if (object) (void)PetscObjectReference(reinterpret_cast<PetscObject>(object));
-    reset();
-    object_ = object;
-  }
   void reset()
   {
     if (object_) (void)Destroy(&object_);
@@ -123,7 +114,6 @@ private:
 using DMHandle = Handle<DM, DMDestroy>;
 using FEHandle = Handle<PetscFE, PetscFEDestroy>;
 using ISHandle = Handle<IS, ISDestroy>;
-using LabelHandle = Handle<DMLabel, DMLabelDestroy>;
 using MatHandle = Handle<Mat, MatDestroy>;
 using QuadratureHandle = Handle<PetscQuadrature, PetscQuadratureDestroy>;
 using SectionHandle = Handle<PetscSection, PetscSectionDestroy>;

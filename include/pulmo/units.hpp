@@ -6,6 +6,5 @@ namespace pulmo::units {
 
 constexpr double kPa_per_cmH2O = 0.0980665; ///< by definition of the conventional water column
 constexpr double mm3_per_ml = 1000.0;
-constexpr double mm2_per_cm2 = 100.0;
 
 } // namespace pulmo::units

@@ -66,9 +66,10 @@ TEST(Mesh, TwoLungsAreOneMesh)
 TEST(Mesh, PinsFollowAxes)
 {
   Mesh mesh;
-  std::array<Mesh::Pin, 3> pins;
+  std::vector<Mesh::Pin> pins;
   PULMO_OK(read(mesh, "cube.msh"));
   PULMO_OK(mesh.rigid_pins(pins));
+  ASSERT_EQ(pins.size(), 3u);
   // the cube has corners along its axes: none of the pins turns it when it swells about the first
   for (int k = 1; k < 3; ++k)
     for (int d = 0; d < 3; ++d) {
@@ -80,6 +81,18 @@ TEST(Mesh, PinsFollowAxes)
   for (const Mesh::Pin &pin : pins)
     for (bool component : pin.component) held += component;
   EXPECT_EQ(held, 6);
+}
+
+TEST(Mesh, EachLungHasItsOwnPins)
+{
+  Mesh mesh;
+  std::vector<Mesh::Pin> pins;
+  PULMO_OK(read(mesh, "lung_pair.msh"));
+  PULMO_OK(mesh.rigid_pins(pins));
+  ASSERT_EQ(pins.size(), 6u);
+  for (int body = 0; body < 2; ++body) // the right lung lies at x > 0, the left one at x < 0
+    for (int k = 1; k < 3; ++k) EXPECT_GT(pins[3 * body + k].x[0] * pins[3 * body].x[0], 0);
+  EXPECT_LT(pins[0].x[0] * pins[3].x[0], 0);
 }
 
 } // namespace

@@ -108,7 +108,6 @@ public:
   const char *about() const override { return "Darcy flow of alveolar air (mass balance, pressure field)"; }
   bool active() const override { return on_; }
   PetscReal porosity() const { return porosity_; }
-  const std::vector<std::string> &surfaces() const { return surfaces_; }
 
   PetscErrorCode declare(Options &options) override
   {

@@ -61,7 +61,7 @@ public:
       c.constrain(hold);
     }
     if (rigid_) {
-      std::array<Mesh::Pin, 3> pins;
+      std::vector<Mesh::Pin> pins;
       PetscCall(c.mesh().rigid_pins(pins));
       for (const Mesh::Pin &pin : pins) {
         Constraint hold;

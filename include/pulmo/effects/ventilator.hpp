@@ -42,7 +42,7 @@ public:
     PetscCall(options.real("ramp", "s", Range::not_negative(), "rise of pressure at the start of inspiration", ramp_));
     PetscCall(options.real("ramp_down", "s", Range::not_negative(),
                            "fall of pressure at the start of expiration (0: from the first step)", ramp_down_));
-    PetscCall(options.whole("breaths", "-", Range::between(1, 1e9), "number of breaths", breaths_));
+    PetscCall(options.whole("breaths", "-", Range::between(1, 100000), "number of breaths", breaths_));
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
@@ -102,7 +102,6 @@ public:
   }
   /// cmH2O.
   PetscReal peep() const { return peep_; }
-  PetscReal pip() const { return pip_; }
 
 private:
   std::string mode_ = "off";
