@@ -114,11 +114,12 @@ PetscErrorCode Options::find(const std::string &name, const std::string &default
   PetscBool set, has;
 
   PetscFunctionBeginUser;
-  declared_.push_back({option, default_value, unit, range, help, groups_.size() - 1});
+  declared_.push_back({option, default_value, unit, range, help, default_value, groups_.size() - 1});
   PetscCall(PetscOptionsGetString(nullptr, nullptr, option.c_str(), buffer, sizeof(buffer), &set));
   PetscCall(PetscOptionsHasName(nullptr, nullptr, option.c_str(), &has));
   is_given = has && group.in_use; // check_unknown() reports an option of an effect or law that is not in use
   if (has) raw = buffer;
+  if (is_given) declared_.back().used = raw;
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -287,6 +288,23 @@ PetscErrorCode Options::all_given(std::vector<std::pair<std::string, std::string
       list.emplace_back(word, "");
     else if (!list.empty())
       list.back().second += (list.back().second.empty() ? "" : " ") + word;
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Options::all_used(std::vector<std::pair<std::string, std::string>> &list) const
+{
+  std::vector<std::pair<std::string, std::string>> given;
+
+  PetscFunctionBeginUser;
+  list.clear();
+  for (const Declared &d : declared_)
+    if (groups_[d.group].in_use) list.emplace_back(d.name, d.used);
+  PetscCall(all_given(given));
+  for (const auto &[name, value] : given) {
+    const std::string &option = name;
+    const auto same = [&](const Declared &d) { return d.name == option; };
+    if (std::none_of(declared_.begin(), declared_.end(), same)) list.emplace_back(name, value);
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }

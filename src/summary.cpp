@@ -40,14 +40,14 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
   const MPI_Comm comm = options.comm();
   PetscMPIInt rank, size;
   PetscInt dofs;
-  std::vector<std::pair<std::string, std::string>> given;
+  std::vector<std::pair<std::string, std::string>> used;
   int written = 1;
 
   PetscFunctionBeginUser;
   PetscCallMPI(MPI_Comm_rank(comm, &rank));
   PetscCallMPI(MPI_Comm_size(comm, &size));
   PetscCall(VecGetSize(simulation.state(), &dofs));
-  PetscCall(options.all_given(given));
+  PetscCall(options.all_used(used));
   const std::string file = output.path(finished ? "summary.json" : "failure.json");
   if (rank == 0) {
     Json json;
@@ -95,7 +95,7 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
     json["integration"] = model.own_integration() ? "pulmo" : "basic";
     json["version"] = PULMO_VERSION;
     Json list;
-    for (const auto &[name, value] : given) list[name] = value;
+    for (const auto &[name, value] : used) list[name] = value;
     json["options"] = list;
 
     const std::string part = file + ".part";

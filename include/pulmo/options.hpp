@@ -64,12 +64,16 @@ public:
   PetscErrorCode warn_unused() const;
   /// Prints every declared option (the part of -help that is pulmo's own).
   PetscErrorCode print_help() const;
-  /// The full name and value of each option in the database, as the run used them.
+  /// Name and value of each option in the database.
   PetscErrorCode all_given(std::vector<std::pair<std::string, std::string>> &list) const;
+  /// Name and value of every option that the run used: pulmo's own of what is in use, defaults included, and PETSc's
+  /// as given.
+  PetscErrorCode all_used(std::vector<std::pair<std::string, std::string>> &list) const;
 
 private:
   struct Declared {
-    std::string name, value, unit, range, help;
+    std::string name, value, unit, range, help; ///< value: the default
+    std::string used;                           ///< as given, or the default
     std::size_t group;
   };
   struct Group {
