@@ -6,27 +6,38 @@ namespace pulmo {
 
 namespace {
 
+/// What a user is told of an error that PETSc found in an option's value; empty for every other error.
+std::string option_error(PetscErrorCode code, const std::string &message)
+{
+  const std::string first_line = message.substr(0, message.find('\n')), no_number = "Input string ";
+  if (code == PETSC_ERR_ARG_UNKNOWN_TYPE) // -pc_type lemon
+    return first_line + ": a PETSc option names a type that this PETSc does not have; check its spelling";
+  if (message.rfind(no_number, 0) != 0) return "";
+  // -ts_dt short: PETSc names the word only
+  const std::string word = message.substr(no_number.size(), message.find(' ', no_number.size()) - no_number.size());
+  std::vector<std::pair<std::string, std::string>> given;
+  std::string option = "an option";
+  (void)Options(PETSC_COMM_WORLD).all_given(given);
+  for (const auto &[name, value] : given)
+    if (value == word) option = "option " + name;
+  return option + " takes a number, not '" + word + "'";
+}
+
 /// User errors: one sentence from one rank. Everything else: PETSc's trace.
 PetscErrorCode handle_error(MPI_Comm comm, int line, const char *function, const char *file, PetscErrorCode code,
                             PetscErrorType type, const char *message, void *context)
 {
-  // -pc_type, -petscpartitioner_type, ... with a name that PETSc does not have: the user's to mend, too
-  // and -ts_dt abc
-  const std::string text = message ? message : "";
-  const bool unknown_type = code == PETSC_ERR_ARG_UNKNOWN_TYPE;
-  const bool bad_value = text.rfind("Input string", 0) == 0;
-  if (code != PETSC_ERR_USER_INPUT && !unknown_type && !bad_value)
-    return PetscTraceBackErrorHandler(comm, line, function, file, code, type, message, context);
+  std::string text = message ? message : "";
+  if (code != PETSC_ERR_USER_INPUT) {
+    text = type == PETSC_ERROR_INITIAL ? option_error(code, text) : "";
+    if (text.empty()) return PetscTraceBackErrorHandler(comm, line, function, file, code, type, message, context);
+  }
   if (type == PETSC_ERROR_INITIAL) {
-    PetscMPIInt rank = 0;
-    (void)MPI_Comm_rank(comm, &rank);
+    PetscMPIInt rank = 0; // options are the same on all ranks, so all ranks are here
+    (void)MPI_Comm_rank(PETSC_COMM_WORLD, &rank);
     if (rank == 0) {
       std::fflush(stdout);
-      const char *mend = unknown_type
-                             ? ": a PETSc option names a type that this PETSc does not have; check its spelling"
-                         : bad_value ? ": a PETSc option has a value of the wrong kind; check it"
-                                     : "";
-      std::fprintf(stderr, "pulmo: error: %s%s\n", text.substr(0, text.find('\n')).c_str(), mend);
+      std::fprintf(stderr, "pulmo: error: %s\n", text.c_str());
     }
   }
   return PETSC_ERR_USER_INPUT; // callers get what the handler returns
