@@ -224,6 +224,8 @@ def table(m):
         "a word for a step": (good + ["-ts_dt", "short"], ["-ts_dt", "number", "short"]),
         "a word for a number of PETSc's": (good + ["-snes_rtol", "tiny"], ["-snes_rtol", "number", "tiny"]),
         "no time": (good + ["-ts_max_time", "0"], ["-ts_max_time"]),
+        "a limit on steps": (good + ["-ts_max_steps", "5"], ["-ts_max_steps", "-ts_max_time"]),
+        "another step control": (good + ["-ts_adapt_type", "none"], ["-ts_adapt_type"]),
         "unknown solver type": (good + ["-pc_type", "lemon"], ["lemon"]),
         "unknown element type": (good + ["-petscfe_type", "cubist"], ["cubist"]),
         "unknown partitioner": (good + ["-petscpartitioner_type", "knife"], ["knife"]),
