@@ -220,11 +220,15 @@ std::vector<Phase> Simulation::phases() const
   return list;
 }
 
+bool Simulation::same(PetscReal t, PetscReal other) const
+{
+  return std::abs(t - other) <= same_time * wanted_dt_;
+}
+
 PetscReal Simulation::landing(PetscReal t) const
 {
-  const PetscReal tolerance = same_time * wanted_dt_;
   for (const PetscReal stop : {phase_->begin + phase_->ramp, phase_->end})
-    if (t < stop - tolerance && t + (1 + stretch) * dt_ > stop) return stop - t;
+    if (t < stop && !same(t, stop) && t + (1 + stretch) * dt_ > stop) return stop - t;
   return dt_;
 }
 
@@ -391,8 +395,7 @@ PetscErrorCode Simulation::after_step()
   PetscCall(TSGetTime(ts_, &t));
   row.dt = t - accepted_.time;
   cut_ = false;
-  const bool landed = std::abs(t - phase_->end) <= same_time * wanted_dt_ ||
-                      std::abs(t - phase_->begin - phase_->ramp) <= same_time * wanted_dt_;
+  const bool landed = same(t, phase_->end) || same(t, phase_->begin + phase_->ramp);
   crawled_ = row.dt < crawling_step * wanted_dt_ && !landed ? crawled_ + 1 : 0;
   if (crawled_ == 0) failures_.clear();
 
@@ -438,7 +441,7 @@ PetscErrorCode Simulation::report(const SignalRow &row, const Measures &measures
   rows_.push_back(row);
   worst_balance_ = std::max(worst_balance_, std::abs(balance));
   min_J_ = std::min(min_J_, measures.min_J);
-  const bool phase_ends = phase_ && std::abs(row.time - phase_->end) <= same_time * wanted_dt_;
+  const bool phase_ends = phase_ && same(row.time, phase_->end);
   const StepReport step{row, measures, balance, before_, end_, phase_ends};
   for (Observer *observer : observers_) PetscCall(observer->observe(step));
   PetscFunctionReturn(PETSC_SUCCESS);

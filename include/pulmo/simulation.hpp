@@ -49,15 +49,13 @@ public:
   /// Counts what was done before the run as set-up, s.
   void setup_took(double seconds) { seconds_.setup = seconds; }
   void add(Observer &observer) { observers_.push_back(&observer); }
-  /// Runs to the end. @p finished is false if no step could be accepted any more; failures() then tells why.
+  /// Runs to the end. @p finished is false if no step could be accepted any more; failure_text() then tells why.
   PetscErrorCode run(bool &finished);
 
-  TS ts() const { return ts_; }
   Vec state() const { return state_; }        ///< global vector, the last accepted state
   Vec local_state() const { return before_; } ///< the same, local, constrained values in place
   PetscReal time() const { return accepted_.time; }
   const std::vector<SignalRow> &rows() const { return rows_; }
-  const std::vector<FailedAttempt> &failures() const { return failures_; }
   PetscReal mass_balance_error() const { return worst_balance_; } ///< largest of the run, mm^3
   PetscReal min_J() const { return min_J_; }
   PetscInt rejected_steps() const { return rejected_; }
@@ -76,6 +74,8 @@ public:
 
 private:
   PetscErrorCode create_solver();
+  /// Whether two times of this run are the same up to rounding.
+  bool same(PetscReal t, PetscReal other) const;
   /// Step size from time @p t, shortened to land on the end of the ramp or of the phase.
   PetscReal landing(PetscReal t) const;
   PetscErrorCode scatter(PetscReal t, Vec X, Vec Xdot);
