@@ -598,4 +598,32 @@ PetscErrorCode Assembly::measure(Vec x, Measures &measures) const
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode Assembly::volume_derivative(Vec x, Vec y, PetscReal &derivative) const
+{
+  PetscFunctionBeginUser;
+  const ReadArray xs(x), ys(y);
+  derivative = 0;
+  for (PetscInt c = 0; c < cells_; ++c) {
+    const PetscInt *dofs = cell_dofs(c);
+    PetscScalar u[3 * 32], v[3 * 32];
+    for (PetscInt i = 0; i < 3 * nodes_; ++i) {
+      u[i] = xs[dofs[i]];
+      v[i] = ys[dofs[i]];
+    }
+    PetscReal sum = 0;
+    for (std::size_t q = 0; q < sample_weights_.size(); ++q) {
+      PetscScalar H[9], G[9], cof_F[9];
+      const PetscReal *gradients = &sample_gradients_[q * nodes_ * 3];
+      sample_gradient(gradients, &invJ_[9 * c], nodes_, u, H);
+      sample_gradient(gradients, &invJ_[9 * c], nodes_, v, G);
+      for (int i = 0; i < 3; ++i) H[4 * i] += 1;
+      cofactor(H, cof_F);
+      sum += sample_weights_[q] * contract(cof_F, G);
+    }
+    derivative += sum * detJ_[c];
+  }
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &derivative, 1, MPIU_REAL, MPI_SUM, PetscObjectComm((PetscObject)dm_)));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 } // namespace pulmo

@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <cstring>
+#include <set>
 
 namespace pulmo {
 
@@ -141,7 +142,8 @@ PetscErrorCode Model::create_weak_form()
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-/// constraint_of[4 * point + component]: which constraint holds that component there, or -1; pressure is component 3.
+/// constraint_of[5 * point + component]: which constraint holds that component there, or -1; pressure is component 3,
+/// pressure steered by the ventilator component 4.
 PetscErrorCode Model::find_constraints(std::vector<PetscInt> &constraint_of)
 {
   PetscInt begin, end, face_begin, face_end;
@@ -150,14 +152,16 @@ PetscErrorCode Model::find_constraints(std::vector<PetscInt> &constraint_of)
   PetscFunctionBeginUser;
   PetscCall(DMPlexGetChart(dm_, &begin, &end));
   PetscCall(DMPlexGetHeightStratum(dm_, 1, &face_begin, &face_end));
-  constraint_of.assign(static_cast<std::size_t>(4 * end), -1);
+  constraint_of.assign(static_cast<std::size_t>(5 * end), -1);
   const auto &constraints = composition().constraints();
   for (std::size_t k = 0; k < constraints.size(); ++k) {
     const Constraint &constraint = constraints[k];
     const auto hold = [&](PetscInt point) {
       for (PetscInt c = 0; c < 3; ++c)
         if (constraint.component[c])
-          constraint_of[4 * point + (constraint.field == displacement ? c : 3)] = static_cast<PetscInt>(k);
+          constraint_of[5 * point + (constraint.field == displacement ? c
+                                     : constraint.at_airway           ? 4
+                                                                      : 3)] = static_cast<PetscInt>(k);
     };
     for (PetscInt vertex : constraint.vertices) hold(vertex);
     if (constraint.surface.empty()) continue;
@@ -185,15 +189,15 @@ PetscErrorCode Model::find_constraints(std::vector<PetscInt> &constraint_of)
   PetscCall(PetscSFGetGraph(sf, &roots, nullptr, nullptr, nullptr));
   if (roots >= 0) {
     std::vector<PetscInt> one(static_cast<std::size_t>(end));
-    for (PetscInt c = 0; c < 4; ++c) {
-      for (PetscInt p = begin; p < end; ++p) one[p] = constraint_of[4 * p + c];
+    for (PetscInt c = 0; c < 5; ++c) {
+      for (PetscInt p = begin; p < end; ++p) one[p] = constraint_of[5 * p + c];
       std::vector<PetscInt> all = one;
       PetscCall(PetscSFReduceBegin(sf, MPIU_INT, one.data(), all.data(), MPI_MAX));
       PetscCall(PetscSFReduceEnd(sf, MPIU_INT, one.data(), all.data(), MPI_MAX));
       one = all;
       PetscCall(PetscSFBcastBegin(sf, MPIU_INT, all.data(), one.data(), MPI_REPLACE));
       PetscCall(PetscSFBcastEnd(sf, MPIU_INT, all.data(), one.data(), MPI_REPLACE));
-      for (PetscInt p = begin; p < end; ++p) constraint_of[4 * p + c] = one[p];
+      for (PetscInt p = begin; p < end; ++p) constraint_of[5 * p + c] = one[p];
     }
   }
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -226,9 +230,9 @@ PetscErrorCode Model::create_section()
   for (PetscInt p = begin; p < end; ++p) {
     int set = 0;
     for (int c = 0; c < 3; ++c)
-      if (constraint_of[4 * p + c] >= 0) set |= 1 << c;
+      if (constraint_of[5 * p + c] >= 0) set |= 1 << c;
     if (set) groups[{displacement, set}].push_back(p);
-    if (constraint_of[4 * p + 3] >= 0 && n_fields > pressure) groups[{pressure, 1}].push_back(p);
+    if (constraint_of[5 * p + 3] >= 0 && n_fields > pressure) groups[{pressure, 1}].push_back(p);
   }
   // every rank passes the same groups in the same order
   for (PetscInt f = 0; f < std::min<PetscInt>(n_fields, 2); ++f)
@@ -250,12 +254,13 @@ PetscErrorCode Model::create_section()
   PetscCall(DMPlexCreateSection(dm_, labels.data(), components.data(), dofs.data(), (PetscInt)bc_field.size(),
                                 bc_field.data(), bc_components.data(), bc_points.data(), nullptr, section.out()));
   for (PetscInt f = 0; f < n_fields; ++f) PetscCall(PetscSectionSetFieldName(section, f, fields[f].name.c_str()));
+  if (composition().common_gas_pressure()) PetscCall(add_carrier(section));
   PetscCall(DMSetLocalSection(dm_, section));
 
   prescribed_.clear();
   for (PetscInt p = begin; p < end; ++p) {
     for (PetscInt c = 0; c < 4; ++c) {
-      const PetscInt k = constraint_of[4 * p + c], f = c < 3 ? displacement : pressure;
+      const PetscInt k = constraint_of[5 * p + c], f = c < 3 ? displacement : pressure;
       PetscInt dof, offset;
       if (k < 0 || f >= n_fields) continue;
       PetscCall(PetscSectionGetFieldDof(section, p, f, &dof));
@@ -269,15 +274,163 @@ PetscErrorCode Model::create_section()
       prescribed_.push_back(value);
     }
   }
+  PetscCall(find_airway(constraint_of));
+  if (closes_rows_) PetscCall(find_carrier());
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Model::set_step(PetscReal dt, PetscReal airway_pressure)
+/// The airway's nodes, with their share of its area (of P1 basis functions).
+PetscErrorCode Model::find_airway(const std::vector<PetscInt> &constraint_of)
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
+  PetscSection section, global;
+  PetscInt begin, end, face_begin, face_end;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMGetLocalSection(dm_, &section));
+  PetscCall(DMGetGlobalSection(dm_, &global)); // made here, used by DMPlexGetPointGlobalField
+  PetscCall(DMPlexGetChart(dm_, &begin, &end));
+  PetscCall(DMPlexGetHeightStratum(dm_, 1, &face_begin, &face_end));
+  std::map<PetscInt, PetscReal> share; // of each vertex
+  std::set<std::string> surfaces;
+  for (const Constraint &c : composition().constraints())
+    if (c.at_airway) surfaces.insert(c.surface);
+  closes_rows_ = !surfaces.empty() || composition().common_gas_pressure();
+  for (const std::string &surface : surfaces) {
+    DMLabel label;
+    ISHandle stratum;
+    PetscCall(DMGetLabel(dm_, surface.c_str(), &label));
+    PetscCall(DMLabelGetStratumIS(label, mesh_->surface(surface).value, stratum.out()));
+    if (!stratum) continue;
+    PetscInt n;
+    const PetscInt *points;
+    PetscCall(ISGetLocalSize(stratum, &n));
+    PetscCall(ISGetIndices(stratum, &points));
+    for (PetscInt i = 0; i < n; ++i) {
+      PetscInt *closure = nullptr, n_closure;
+      PetscReal area;
+      if (points[i] < face_begin || points[i] >= face_end) continue;
+      PetscCall(DMPlexComputeCellGeometryFVM(dm_, points[i], &area, nullptr, nullptr));
+      PetscCall(DMPlexGetTransitiveClosure(dm_, points[i], PETSC_TRUE, &n_closure, &closure));
+      for (PetscInt j = n_closure - 3; j < n_closure; ++j) share[closure[2 * j]] += area / 3; // vertices come last
+      PetscCall(DMPlexRestoreTransitiveClosure(dm_, points[i], PETSC_TRUE, &n_closure, &closure));
+    }
+    PetscCall(ISRestoreIndices(stratum, &points));
+  }
+  for (PetscInt p = begin; p < end && !surfaces.empty(); ++p) {
+    PetscInt dof, offset, row, row_end;
+    if (constraint_of[5 * p + 4] < 0 || constraint_of[5 * p + 3] >= 0) continue;
+    PetscCall(PetscSectionGetFieldDof(section, p, pressure, &dof));
+    if (dof == 0) continue;
+    PetscCall(PetscSectionGetFieldOffset(section, p, pressure, &offset));
+    PetscCall(DMPlexGetPointGlobalField(dm_, p, pressure, &row, &row_end));
+    airway_.push_back({p, offset, row < 0 ? -1 : row, share.count(p) ? share[p] : 0});
+  }
+  airway_area_ = 0;
+  for (const AirwayNode &node : airway_) {
+    airway_area_ += node.area;
+    if (node.row >= 0) closed_rows_.push_back(node.row);
+  }
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &airway_area_, 1, MPIU_REAL, MPI_SUM, comm));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Rebuilds the section with a dof of its own for the uniform gas pressure, on the first cell of the first rank that
+/// has one. It belongs to no field, so element loops do not see it.
+PetscErrorCode Model::add_carrier(SectionHandle &section)
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
+  SectionHandle wider;
+  PetscInt begin, end, cell_begin, cell_end, n_fields;
+  PetscMPIInt rank;
+
+  PetscFunctionBeginUser;
+  PulmoUserCheck(own_, comm,
+                 "-petscfe_type basic cannot carry the unknown gas pressure of a flow phase without -airflow; use the "
+                 "default, pulmo");
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  PetscCall(DMPlexGetHeightStratum(dm_, 0, &cell_begin, &cell_end));
+  PetscMPIInt first = cell_end > cell_begin ? rank : PETSC_MPI_INT_MAX;
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &first, 1, MPI_INT, MPI_MIN, comm));
+  carrier_rank_ = first;
+  const PetscInt carrier = rank == first ? cell_begin : -1;
+  // as many dofs as every other mesh point has, so that the matrix keeps its block size; one of them is used
+  const PetscInt dofs = composition().fields()[displacement].components;
+
+  PetscCall(PetscSectionGetChart(section, &begin, &end));
+  PetscCall(PetscSectionGetNumFields(section, &n_fields));
+  PetscCall(PetscSectionCreate(comm, wider.out()));
+  PetscCall(PetscSectionSetNumFields(wider, n_fields));
+  PetscCall(PetscSectionSetChart(wider, begin, end));
+  for (PetscInt f = 0; f < n_fields; ++f) {
+    PetscInt components;
+    const char *name;
+    PetscCall(PetscSectionGetFieldComponents(section, f, &components));
+    PetscCall(PetscSectionSetFieldComponents(wider, f, components));
+    PetscCall(PetscSectionGetFieldName(section, f, &name));
+    PetscCall(PetscSectionSetFieldName(wider, f, name));
+  }
+  PetscInt dof;
+  for (PetscInt p = begin; p < end; ++p) {
+    PetscCall(PetscSectionGetDof(section, p, &dof));
+    PetscCall(PetscSectionSetDof(wider, p, dof + (p == carrier ? dofs : 0)));
+    PetscCall(PetscSectionGetConstraintDof(section, p, &dof));
+    PetscCall(PetscSectionSetConstraintDof(wider, p, dof));
+    for (PetscInt f = 0; f < n_fields; ++f) {
+      PetscCall(PetscSectionGetFieldDof(section, p, f, &dof));
+      PetscCall(PetscSectionSetFieldDof(wider, p, f, dof));
+      PetscCall(PetscSectionGetFieldConstraintDof(section, p, f, &dof));
+      PetscCall(PetscSectionSetFieldConstraintDof(wider, p, f, dof));
+    }
+  }
+  PetscCall(PetscSectionSetUp(wider));
+  for (PetscInt p = begin; p < end; ++p) {
+    const PetscInt *which;
+    PetscCall(PetscSectionGetConstraintDof(section, p, &dof));
+    if (dof == 0) continue;
+    PetscCall(PetscSectionGetConstraintIndices(section, p, &which));
+    PetscCall(PetscSectionSetConstraintIndices(wider, p, which));
+    for (PetscInt f = 0; f < n_fields; ++f) {
+      PetscCall(PetscSectionGetFieldConstraintIndices(section, p, f, &which));
+      PetscCall(PetscSectionSetFieldConstraintIndices(wider, p, f, which));
+    }
+  }
+  section = std::move(wider);
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::find_carrier()
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
+  PetscMPIInt rank;
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  if (composition().common_gas_pressure()) {
+    PetscSection global;
+    PetscInt cell, dof;
+    PetscCall(DMGetGlobalSection(dm_, &global));
+    PetscCall(DMPlexGetHeightStratum(dm_, 0, &cell, nullptr));
+    if (rank == carrier_rank_) {
+      PetscCall(PetscSectionGetDof(global, cell, &dof));
+      PetscCall(PetscSectionGetOffset(global, cell, &carrier_));
+      for (PetscInt d = 0; d < dof; ++d) closed_rows_.push_back(carrier_ + d);
+    }
+  } else {
+    PetscMPIInt first = closed_rows_.empty() ? PETSC_MPI_INT_MAX : rank;
+    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &first, 1, MPI_INT, MPI_MIN, comm));
+    carrier_rank_ = first;
+    if (rank == first) carrier_ = closed_rows_.front();
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::set_step(PetscReal dt, PetscReal airway_pressure, PetscReal airway_flow)
 {
   const PetscReal L = mesh_->length();
 
   PetscFunctionBeginUser;
-  step_ = {dt, airway_pressure};
+  step_ = {dt, airway_pressure, airway_area_ > 0 ? -airway_flow / airway_area_ : 0};
   row_scale_[displacement] = 1 / (modulus_ * L * L);
   if (row_scale_.size() > pressure) row_scale_[pressure] = dt / (L * L * L);
   PetscCall(pack_constants());
@@ -320,6 +473,8 @@ PetscErrorCode Model::constrain(PetscReal t, Vec local) const
     composition().constraints()[p.constraint].value(t, p.x, value);
     x[p.dof] = value[p.component];
   }
+  if (airway_held_)
+    for (const AirwayNode &node : airway_) x[node.dof] = step_.gas_pressure;
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -329,6 +484,67 @@ PetscErrorCode Model::constrain_rate(Vec local, Vec before, PetscReal dt, Vec ra
   const ReadArray now(local), then(before);
   WriteArray r(rate);
   for (const Prescribed &p : prescribed_) r[p.dof] = (now[p.dof] - then[p.dof]) / dt;
+  if (airway_held_)
+    for (const AirwayNode &node : airway_) r[node.dof] = (now[node.dof] - then[node.dof]) / dt;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::close_rows(Vec F) const
+{
+  PetscFunctionBeginUser;
+  if (airway_held_ && !closed_rows_.empty()) {
+    PetscInt first;
+    PetscCall(VecGetOwnershipRange(F, &first, nullptr));
+    WriteArray f(F);
+    for (const PetscInt row : closed_rows_) f[row - first] = 0;
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::carrier_value(Vec X, PetscReal &value) const
+{
+  PetscFunctionBeginUser;
+  value = 0;
+  if (carrier_ >= 0) {
+    PetscInt first;
+    PetscCall(VecGetOwnershipRange(X, &first, nullptr));
+    value = ReadArray(X)[carrier_ - first];
+  }
+  PetscCallMPI(MPI_Bcast(&value, 1, MPIU_REAL, carrier_rank_, PetscObjectComm((PetscObject)X)));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::set_carrier_value(Vec X, PetscReal value) const
+{
+  PetscFunctionBeginUser;
+  if (carrier_ >= 0) PetscCall(VecSetValue(X, carrier_, value, INSERT_VALUES));
+  PetscCall(VecAssemblyBegin(X));
+  PetscCall(VecAssemblyEnd(X));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::set_airway_nodes(Vec X, PetscReal value) const
+{
+  PetscInt first;
+
+  PetscFunctionBeginUser;
+  PetscCall(VecGetOwnershipRange(X, &first, nullptr));
+  {
+    WriteArray x(X);
+    for (const AirwayNode &node : airway_)
+      if (node.row >= 0) x[node.row - first] = value;
+  }
+  PetscCall(set_carrier_value(X, value));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::airway_mean_pressure(Vec local, PetscReal &mean) const
+{
+  PetscFunctionBeginUser;
+  const ReadArray x(local);
+  mean = 0;
+  for (const AirwayNode &node : airway_) mean += node.area * x[node.dof] / airway_area_;
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &mean, 1, MPIU_REAL, MPI_SUM, PetscObjectComm((PetscObject)(DM)dm_)));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -368,6 +584,8 @@ PetscErrorCode Model::jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, Mat
   if (!own_) PetscCall(stock_jacobian(t, x, x_t, shift, A));
   PetscCall(
       assembly_.jacobian(own_ ? Assembly::Part::all : Assembly::Part::facets, t, x, x_t, shift, row_scale_.data(), A));
+  if (closes_rows_ && airway_held_)
+    PetscCall(MatZeroRowsColumns(A, (PetscInt)closed_rows_.size(), closed_rows_.data(), 1, nullptr, nullptr));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -396,8 +614,7 @@ PetscErrorCode Model::airway_flow(Vec F, PetscReal &flow) const
   PetscFunctionBeginUser;
   if (row_scale_.size() > pressure) {
     const ReadArray f(F);
-    for (const Prescribed &p : prescribed_)
-      if (composition().constraints()[p.constraint].at_airway) sum += f[p.dof] / row_scale_[pressure];
+    for (const AirwayNode &node : airway_) sum += f[node.dof] / row_scale_[pressure];
   }
   PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &sum, 1, MPI_DOUBLE, MPI_SUM, comm));
   flow = sum;

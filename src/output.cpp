@@ -95,9 +95,9 @@ PetscErrorCode SignalWriter::observe(const StepReport &step)
     if (!file_) {
       file_ = std::fopen(output_.path("signals.csv.part").c_str(), "w");
       if (file_)
-        std::fprintf(file_, "time_s,%s%svolume_ml,%sdt_s,newton_iterations,krylov_iterations,min_J,max_J\n",
+        std::fprintf(file_, "time_s,%s%svolume_ml,%sdt_s,newton_iterations,krylov_iterations,min_J,max_J%s\n",
                      ventilator ? "airway_pressure_cmH2O," : "", flow ? "flow_ml_per_s," : "",
-                     ventilator ? "phase," : "");
+                     ventilator ? "phase," : "", facts_.tube ? ",ventilator_pressure_cmH2O" : "");
     }
     if (file_) {
       const SignalRow &r = step.row;
@@ -106,7 +106,9 @@ PetscErrorCode SignalWriter::observe(const StepReport &step)
       if (flow) std::fprintf(file_, "%.15g,", r.flow);
       std::fprintf(file_, "%.15g,", r.volume);
       if (ventilator) std::fprintf(file_, "%s,", r.phase.c_str());
-      std::fprintf(file_, "%.15g,%ld,%ld,%.15g,%.15g\n", r.dt, r.newton, r.krylov, r.min_J, r.max_J);
+      std::fprintf(file_, "%.15g,%ld,%ld,%.15g,%.15g", r.dt, r.newton, r.krylov, r.min_J, r.max_J);
+      if (facts_.tube) std::fprintf(file_, ",%.15g", r.ventilator_pressure);
+      std::fprintf(file_, "\n");
     }
     written = file_ && std::fflush(file_) == 0 && !std::ferror(file_);
   }

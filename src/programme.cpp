@@ -1,25 +1,268 @@
 #include "pulmo/programme.hpp"
 
+#include "pulmo/units.hpp"
+
 #include <algorithm>
 #include <cmath>
+#include <fstream>
+#include <sstream>
 
 namespace pulmo {
 
-PetscReal Phase::pressure(PetscReal t) const
+namespace {
+
+/// More phases than this in a file are a slip (a repeat count with a digit too many).
+constexpr std::size_t max_phases = 1000000;
+
+PetscReal internal(Control control, PetscReal value)
 {
-  const PetscReal since = t - begin;
-  return ramp > 0 && since < ramp ? from + (to - from) * std::max<PetscReal>(since, 0) / ramp : to;
+  return value * (control == Control::pressure ? units::kPa_per_cmH2O : units::mm3_per_ml);
 }
 
-PetscReal Programme::pressure(PetscReal t) const
+} // namespace
+
+PetscReal Phase::value(PetscReal t) const
 {
-  if (phases_.empty()) return 0;
-  if (t <= phases_.front().begin) return phases_.front().from;
-  // the last step of a phase ends there up to rounding: it must not see the next phase
-  const PetscReal rounding = 1e-12 * (1 + std::abs(t));
-  const auto phase = std::lower_bound(phases_.begin(), phases_.end(), t - rounding,
-                                      [](const Phase &p, PetscReal time) { return p.end < time; });
-  return phase == phases_.end() ? phases_.back().pressure(phases_.back().end) : phase->pressure(t);
+  const PetscReal since = std::max<PetscReal>(t - begin, 0);
+  return ramp > 0 && since < ramp ? *from + (to - *from) * since / ramp : to;
+}
+
+PetscReal Phase::delivered(PetscReal t) const
+{
+  const PetscReal since = t - begin, rising = std::min(since, ramp);
+  PetscReal volume = to * (since - rising);
+  if (ramp > 0) volume += rising * (*from + (to - *from) * rising / (2 * ramp));
+  return volume;
+}
+
+bool Programme::prescribes_flow() const
+{
+  return std::any_of(phases_.begin(), phases_.end(), [](const Phase &p) { return p.control == Control::flow; });
+}
+
+Phase &ProgrammeBuilder::add(const std::string &name, PetscInt breath, PetscReal duration, Control control,
+                             PetscReal value, PetscReal ramp, std::optional<PetscReal> from)
+{
+  Phase phase;
+  phase.name = name;
+  phase.breath = breath;
+  phase.begin = phases_.empty() ? 0 : phases_.back().end;
+  phase.end = phase.begin + duration;
+  phase.control = control;
+  phase.to = internal(control, value);
+  phase.ramp = ramp;
+  if (from)
+    phase.from = internal(control, *from);
+  else if (phases_.empty())
+    phase.from = 0;
+  else if (phases_.back().control == control)
+    phase.from = phases_.back().to;
+  else if (control == Control::flow)
+    phase.from = 0;
+  phases_.push_back(phase);
+  return phases_.back();
+}
+
+namespace {
+
+/// A line of a programme file, cut into words.
+struct Line {
+  int number;
+  std::vector<std::string> words;
+};
+
+/// Lines without comments and blanks.
+std::vector<Line> cut(const std::string &text)
+{
+  std::vector<Line> lines;
+  std::istringstream in(text);
+  std::string raw;
+  for (int number = 1; std::getline(in, raw); ++number) {
+    std::istringstream words(raw.substr(0, raw.find('#')));
+    Line line{number, {}};
+    for (std::string word; words >> word;) line.words.push_back(word);
+    if (!line.words.empty()) lines.push_back(line);
+  }
+  return lines;
+}
+
+/// Turns the lines of a file into phases.
+class Parser {
+public:
+  Parser(MPI_Comm comm, const std::string &file, const std::string &text) : comm_(comm), file_(file), lines_(cut(text))
+  {}
+
+  PetscErrorCode parse(std::vector<Phase> &phases)
+  {
+    PetscFunctionBeginUser;
+    PetscCall(block(0, lines_.size(), -1));
+    phases = builder_.take();
+    PulmoUserCheck(!phases.empty(), comm_,
+                   "%s holds no phase; write lines such as 'inspiration 1.0 pressure 15 ramp 0.1'", file_.c_str());
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+private:
+  /// Lines [begin, end), the body of the repeat at line number @p opened (-1: the whole file).
+  PetscErrorCode block(std::size_t begin, std::size_t end, int opened)
+  {
+    PetscFunctionBeginUser;
+    for (std::size_t i = begin; i < end; ++i) {
+      const Line &line = lines_[i];
+      if (line.words[0] == "repeat") {
+        std::size_t close = i;
+        long times = 0;
+        PetscCall(repeat(i, end, close, times));
+        for (long k = 0; k < times; ++k) PetscCall(block(i + 1, close, line.number));
+        i = close;
+      } else {
+        PulmoUserCheck(line.words[0] != "end", comm_, "%s:%d: 'end' closes no 'repeat'; remove it", file_.c_str(),
+                       line.number);
+        PetscCall(phase(line));
+      }
+    }
+    PulmoUserCheck(opened < 0 || begin < end, comm_, "%s:%d: 'repeat' repeats nothing; write phases before its 'end'",
+                   file_.c_str(), opened);
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+  /// The repeat at line @p i: how often, and which line closes it.
+  PetscErrorCode repeat(std::size_t i, std::size_t end, std::size_t &close, long &times)
+  {
+    const Line &line = lines_[i];
+    PetscReal count = 0;
+    int depth = 0;
+
+    PetscFunctionBeginUser;
+    PulmoUserCheck(line.words.size() == 2, comm_, "%s:%d: 'repeat' takes one whole number, e.g. 'repeat 3'",
+                   file_.c_str(), line.number);
+    PetscCall(number(line, 1, "the count of 'repeat'", count));
+    PulmoUserCheck(count >= 1 && count <= (PetscReal)max_phases && count == std::floor(count), comm_,
+                   "%s:%d: 'repeat %s' must be a whole number of at least 1", file_.c_str(), line.number,
+                   line.words[1].c_str());
+    times = static_cast<long>(count);
+    for (close = i + 1; close < end; ++close) {
+      const std::string &word = lines_[close].words[0];
+      if (word == "repeat") ++depth;
+      if (word == "end" && depth-- == 0) break;
+    }
+    PulmoUserCheck(close < end, comm_, "%s:%d: this 'repeat' has no 'end'; close it", file_.c_str(), line.number);
+    PulmoUserCheck(lines_[close].words.size() == 1, comm_, "%s:%d: 'end' stands alone on its line", file_.c_str(),
+                   lines_[close].number);
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+  /// NAME DURATION pressure|flow VALUE [from VALUE] [ramp SECONDS] [limit CMH2O], or NAME DURATION hold.
+  PetscErrorCode phase(const Line &line)
+  {
+    const auto &w = line.words;
+    PetscReal duration, value = 0, ramp = 0;
+    std::optional<PetscReal> from, limit;
+    std::size_t next = 3;
+
+    PetscFunctionBeginUser;
+    PulmoUserCheck(std::all_of(w[0].begin(), w[0].end(),
+                               [](unsigned char c) { return c < 128 && (std::isalnum(c) || c == '_' || c == '-'); }),
+                   comm_, "%s:%d: a line starts with the phase's name, made of letters, digits, '_' and '-'",
+                   file_.c_str(), line.number);
+    PulmoUserCheck(w.size() >= 3, comm_, "%s:%d: phase '%s' needs a duration in s and pressure, flow or hold",
+                   file_.c_str(), line.number, w[0].c_str());
+    PetscCall(number(line, 1, "the duration (s)", duration));
+    PulmoUserCheck(duration > 0, comm_, "%s:%d: the duration %s s of phase '%s' must be positive", file_.c_str(),
+                   line.number, w[1].c_str(), w[0].c_str());
+    const bool hold = w[2] == "hold";
+    PulmoUserCheck(hold || w[2] == "pressure" || w[2] == "flow", comm_,
+                   "%s:%d: '%s' is no kind of phase; write pressure, flow or hold", file_.c_str(), line.number,
+                   w[2].c_str());
+    const Control control = w[2] == "pressure" ? Control::pressure : Control::flow;
+    if (!hold) {
+      PulmoUserCheck(w.size() >= 4, comm_, "%s:%d: '%s' needs a value in %s", file_.c_str(), line.number, w[2].c_str(),
+                     control == Control::pressure ? "cmH2O" : "ml/s");
+      PetscCall(number(line, 3, control == Control::pressure ? "the pressure (cmH2O)" : "the flow (ml/s)", value));
+      next = 4;
+    }
+    for (; next < w.size(); next += 2) {
+      const std::string &key = w[next];
+      PulmoUserCheck(!hold && (key == "ramp" || key == "from" || (key == "limit" && control == Control::flow)), comm_,
+                     "%s:%d: '%s' does not belong to a %s phase; %s", file_.c_str(), line.number, key.c_str(),
+                     w[2].c_str(),
+                     hold                         ? "hold takes nothing more"
+                     : control == Control::flow ? "it may have 'from', 'ramp' and 'limit'"
+                                                  : "it may have 'from' and 'ramp'");
+      PulmoUserCheck(next + 1 < w.size(), comm_, "%s:%d: '%s' needs a number", file_.c_str(), line.number, key.c_str());
+      PetscReal x;
+      PetscCall(number(line, next + 1, "'" + key + "'", x));
+      if (key == "ramp")
+        ramp = x;
+      else
+        (key == "from" ? from : limit) = x;
+    }
+    PulmoUserCheck(ramp >= 0 && ramp <= duration, comm_,
+                   "%s:%d: the ramp %g s must lie between 0 and the duration %g s of phase '%s'", file_.c_str(),
+                   line.number, (double)ramp, (double)duration, w[0].c_str());
+    PulmoUserCheck(!from || ramp > 0, comm_, "%s:%d: 'from' is the start of a ramp; give 'ramp' too", file_.c_str(),
+                   line.number);
+    if (w[0] == "inspiration") ++breath_;
+    PulmoUserCheck(++phases_ <= max_phases, comm_, "%s:%d: more than %d phases; check the counts of 'repeat'",
+                   file_.c_str(), line.number, (int)max_phases);
+    Phase &added = builder_.add(w[0], breath_, duration, control, value, ramp, from);
+    if (limit) added.limit = internal(Control::pressure, *limit);
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+  PetscErrorCode number(const Line &line, std::size_t word, const std::string &what, PetscReal &value) const
+  {
+    const std::string &text = line.words[word];
+    char *rest = nullptr;
+
+    PetscFunctionBeginUser;
+    value = std::strtod(text.c_str(), &rest);
+    PulmoUserCheck(*rest == '\0' && std::isfinite(value), comm_, "%s:%d: %s must be a number, not '%s'", file_.c_str(),
+                   line.number, what.c_str(), text.c_str());
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+  MPI_Comm comm_;
+  const std::string &file_;
+  std::vector<Line> lines_;
+  ProgrammeBuilder builder_;
+  PetscInt breath_ = 0;
+  std::size_t phases_ = 0;
+};
+
+} // namespace
+
+PetscErrorCode parse_programme(MPI_Comm comm, const std::string &file, const std::string &text,
+                               std::vector<Phase> &phases)
+{
+  PetscFunctionBeginUser;
+  PetscCall(Parser(comm, file, text).parse(phases));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode read_programme(MPI_Comm comm, const std::string &option, const std::string &file,
+                              std::vector<Phase> &phases)
+{
+  PetscMPIInt rank;
+  std::string text;
+  long size = -1; // -1: cannot be read
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  if (rank == 0) {
+    std::ifstream in(file, std::ios::binary);
+    std::ostringstream all;
+    if (in && in.peek() != std::ifstream::traits_type::eof()) all << in.rdbuf();
+    text = all.str();
+    if (in && !in.bad()) size = static_cast<long>(text.size());
+    if (in.eof()) size = 0; // empty
+  }
+  PetscCallMPI(MPI_Bcast(&size, 1, MPI_LONG, 0, comm));
+  PulmoUserCheck(size >= 0, comm, "cannot read %s (%s); check its name", file.c_str(), option.c_str());
+  text.resize(static_cast<std::size_t>(size));
+  PetscCallMPI(MPI_Bcast(text.data(), static_cast<PetscMPIInt>(size), MPI_CHAR, 0, comm));
+  PetscCall(parse_programme(comm, file, text, phases));
+  PetscFunctionReturn(PETSC_SUCCESS);
 }
 
 } // namespace pulmo

@@ -5,6 +5,7 @@
 #include "pulmo/effects/lumen_pressure.hpp"
 #include "pulmo/effects/support.hpp"
 #include "pulmo/effects/traction.hpp"
+#include "pulmo/effects/tube.hpp"
 #include "pulmo/tissue/berger.hpp"
 #include "pulmo/tissue/birzle.hpp"
 #include "pulmo/tissue/ma.hpp"
@@ -29,6 +30,7 @@ Registry Registry::standard()
   r.effect<LumenPressure>();
   r.effect<Support>();
   r.effect<Traction>();
+  r.effect<Tube>();
   return r;
 }
 

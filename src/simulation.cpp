@@ -25,6 +25,9 @@ constexpr PetscReal least_step = 1e-6;
 constexpr PetscReal crawling_step = 1e-3;
 constexpr int crawling_steps = 50;
 
+/// Newton steps that a prescribed volume may ask for beyond PETSc's tests (rounding may keep it from being met).
+constexpr int max_extra_newton = 3;
+
 /// Failed attempts that are remembered.
 constexpr std::size_t max_failures = 12;
 
@@ -66,6 +69,38 @@ PetscErrorCode simulation_of(TS ts, Simulation **simulation)
   PetscFunctionBeginUser;
   PetscCall(TSGetApplicationContext(ts, simulation));
   PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode pre_stage(TS ts, PetscReal t)
+{
+  Simulation *simulation;
+
+  PetscFunctionBeginUser;
+  PetscCall(simulation_of(ts, &simulation));
+  PetscCall(simulation->before_stage(t));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode initial_guess(SNES, Vec X, void *simulation)
+{
+  return static_cast<Simulation *>(simulation)->guess(X);
+}
+
+PetscErrorCode newton_step(SNESLineSearch search, Vec X, Vec Y, PetscBool *changed, void *simulation)
+{
+  SNES snes;
+
+  PetscFunctionBeginUser;
+  PetscCall(SNESLineSearchGetSNES(search, &snes));
+  PetscCall(static_cast<Simulation *>(simulation)->border(snes, X, Y));
+  *changed = PETSC_TRUE;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode newton_converged(SNES snes, PetscInt it, PetscReal xnorm, PetscReal ynorm, PetscReal fnorm,
+                                SNESConvergedReason *reason, void *simulation)
+{
+  return static_cast<Simulation *>(simulation)->converged(snes, it, xnorm, ynorm, fnorm, reason);
 }
 
 PetscErrorCode post_stage(TS ts, PetscReal, PetscInt, Vec *)
@@ -177,6 +212,7 @@ PetscErrorCode Simulation::create_solver()
   PetscCall(TSSetExactFinalTime(ts_, TS_EXACTFINALTIME_MATCHSTEP));
   PetscCall(TSSetMaxSNESFailures(ts_, -1));
   PetscCall(TSSetErrorIfStepFails(ts_, PETSC_FALSE));
+  PetscCall(TSSetPreStage(ts_, pre_stage));
   PetscCall(TSSetPostStage(ts_, post_stage));
   PetscCall(TSSetPostStep(ts_, post_step));
   PetscCall(TSGetAdapt(ts_, &adapt));
@@ -190,7 +226,24 @@ PetscErrorCode Simulation::create_solver()
     PetscCall(KSPGetPC(ksp, &pc));
     PetscCall(PCSetOptionsPrefix(pc, "fieldsplit_displacement_"));
   }
+  PetscCall(SNESSetComputeInitialGuess(snes, initial_guess, this));
   PetscCall(TSSetFromOptions(ts_));
+  if (scene_.facts().ventilator && scene_.facts().ventilator->prescribes_flow())
+    PetscCall(SNESSetConvergenceTest(snes, newton_converged, this, nullptr));
+  if (scene_.facts().common_pressure()) {
+    SNESLineSearch search;
+    PetscBool newton;
+    PetscCall(PetscObjectTypeCompare((PetscObject)snes, SNESNEWTONLS, &newton));
+    PulmoUserCheck(newton, comm,
+                   "-snes_type: an airway pressure that is an unknown of its own needs Newton with line search; use "
+                   "-snes_type newtonls");
+    PetscCall(SNESGetLineSearch(snes, &search));
+    PetscCall(SNESLineSearchSetPreCheck(search, newton_step, this));
+    PetscCall(VecDuplicate(state_, border_x_.out()));
+    PetscCall(VecDuplicate(state_, border_b_.out()));
+    PetscCall(VecDuplicate(state_, border_z_.out()));
+    PetscCall(VecDuplicate(local_, border_y_.out()));
+  }
   PetscCall(TSGetTimeStep(ts_, &wanted_dt_));
   PulmoUserCheck(wanted_dt_ > 0, comm, "-ts_dt %g s must be positive", (double)wanted_dt_);
   PetscCall(TSGetMaxTime(ts_, &max_time));
@@ -214,7 +267,12 @@ std::vector<Phase> Simulation::phases() const
   if (scene_.facts().ventilator)
     list = scene_.facts().ventilator->phases();
   else
-    list.push_back({"run", 0, 0, max_time < PETSC_MAX_REAL ? max_time : 1, 0, 0, 0});
+  {
+    Phase run;
+    run.name = "run";
+    run.end = max_time < PETSC_MAX_REAL ? max_time : 1;
+    list.push_back(run);
+  }
   while (list.size() > 1 && list.back().begin >= max_time) list.pop_back();
   list.back().end = std::min(list.back().end, max_time);
   return list;
@@ -255,7 +313,9 @@ PetscErrorCode Simulation::run(bool &finished)
   accepted_ = SignalRow();
   accepted_.phase = phases_.front().name;
   accepted_.breath = static_cast<int>(phases_.front().breath);
-  accepted_.pressure = phases_.front().from / units::kPa_per_cmH2O;
+  if (phases_.front().control == Control::pressure) // a run begins with all at rest, or with a pressure of its own
+    accepted_.pressure = phases_.front().from.value_or(0) / units::kPa_per_cmH2O;
+  accepted_.ventilator_pressure = accepted_.pressure;
   PetscCall(report(accepted_, measures));
 
   finished = true;
@@ -263,6 +323,7 @@ PetscErrorCode Simulation::run(bool &finished)
   for (const Phase &phase : phases_) {
     TSConvergedReason reason;
     phase_ = &phase;
+    airway_.begin_phase(phase, accepted_.volume * units::mm3_per_ml);
     PetscCall(TSSetTime(ts_, phase.begin));
     PetscCall(TSSetMaxTime(ts_, phase.end));
     PetscCall(TSSetTimeStep(ts_, landing(phase.begin)));
@@ -280,6 +341,17 @@ PetscErrorCode Simulation::run(bool &finished)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode Simulation::before_stage(PetscReal t)
+{
+  PetscReal dt;
+
+  PetscFunctionBeginUser;
+  PetscCall(TSGetTimeStep(ts_, &dt));
+  airway_.begin_step(t, dt);
+  extra_newton_ = 0;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 /// Fills local_ and rate_ from global vectors at time t.
 PetscErrorCode Simulation::scatter(PetscReal t, Vec X, Vec Xdot)
 {
@@ -287,7 +359,7 @@ PetscErrorCode Simulation::scatter(PetscReal t, Vec X, Vec Xdot)
 
   PetscFunctionBeginUser;
   PetscCall(TSGetTimeStep(ts_, &dt));
-  PetscCall(model_.set_step(dt, scene_.facts().airway_pressure(t)));
+  PetscCall(airway_.apply(X));
   PetscCall(DMGlobalToLocal(model_.dm(), X, INSERT_VALUES, local_));
   PetscCall(DMGlobalToLocal(model_.dm(), Xdot, INSERT_VALUES, rate_));
   PetscCall(model_.constrain(t, local_));
@@ -314,6 +386,56 @@ PetscErrorCode Simulation::residual(PetscReal t, Vec X, Vec Xdot, Vec F)
   PetscCall(model_.residual(t, local_, rate_, local_residual_));
   PetscCall(VecZeroEntries(F));
   PetscCall(DMLocalToGlobal(model_.dm(), local_residual_, ADD_VALUES, F));
+  PetscCall(airway_.close(measures.volume_change, F));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// With J y = F known, solves J z = dF/dP and steps to the P for which the linearised scalar equation holds.
+PetscErrorCode Simulation::border(SNES snes, Vec X, Vec Y)
+{
+  constexpr PetscReal share = 1e-4; // every term so far is linear in P: the difference quotient is then exact
+  Vec F;
+  KSP ksp;
+  PetscInt iterations;
+  PetscReal P, along_y, along_z;
+  PetscReal here, there;
+
+  PetscFunctionBeginUser;
+  if (airway_.mode() != Airway::Mode::common) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(airway_.apply(X));
+  PetscCall(airway_.pressure(local_, P));
+  const PetscReal dP = share * std::max(model_.modulus(), std::abs(P));
+  PetscCall(SNESGetFunction(snes, &F, nullptr, nullptr));
+  PetscCall(VecCopy(X, border_x_));
+  PetscCall(model_.set_airway_nodes(border_x_, P + dP));
+  PetscCall(SNESComputeFunction(snes, border_x_, border_b_));
+  PetscCall(model_.carrier_value(F, here));
+  PetscCall(model_.carrier_value(border_b_, there));
+  PetscCall(VecAXPBY(border_b_, -1 / dP, 1 / dP, F));
+  PetscCall(model_.set_airway_nodes(border_b_, 0));
+  PetscCall(VecZeroEntries(border_z_));
+  PetscCall(SNESGetKSP(snes, &ksp));
+  PetscCall(KSPSolve(ksp, border_b_, border_z_));
+  PetscCall(KSPGetIterationNumber(ksp, &iterations));
+  krylov_ += iterations;
+
+  PetscCall(VecZeroEntries(border_y_)); // constrained values do not change
+  PetscCall(DMGlobalToLocal(model_.dm(), Y, INSERT_VALUES, border_y_));
+  PetscCall(model_.volume_derivative(local_, border_y_, along_y));
+  PetscCall(DMGlobalToLocal(model_.dm(), border_z_, INSERT_VALUES, border_y_));
+  PetscCall(model_.volume_derivative(local_, border_y_, along_z));
+  const PetscReal change = airway_.change(here, (there - here) / dP, -along_y, -along_z);
+  PetscCall(VecAXPY(Y, change, border_z_));
+  PetscCall(model_.set_airway_nodes(Y, -change)); // the new state is X - Y
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Simulation::converged(SNES snes, PetscInt it, PetscReal xnorm, PetscReal ynorm, PetscReal fnorm,
+                                     SNESConvergedReason *reason)
+{
+  PetscFunctionBeginUser;
+  PetscCall(SNESConvergedDefault(snes, it, xnorm, ynorm, fnorm, reason, nullptr));
+  if (*reason > 0 && !airway_.satisfied() && extra_newton_++ < max_extra_newton) *reason = SNES_CONVERGED_ITERATING;
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -357,11 +479,18 @@ PetscErrorCode Simulation::accept_stage(Vec X, PetscBool *accept)
   PetscFunctionBeginUser;
   PetscCall(TSGetTime(ts_, &t));
   PetscCall(TSGetTimeStep(ts_, &dt));
+  PetscCall(airway_.apply(X));
   PetscCall(DMGlobalToLocal(model_.dm(), X, INSERT_VALUES, local_));
   PetscCall(model_.constrain(t + dt, local_));
   PetscCall(model_.measure(local_, measures));
   *accept = PetscBool(measures.min_J > 0);
   if (!*accept) PetscCall(reject(dt, "converged to a state with J <= 0", 0, measures, true));
+  if (*accept) {
+    PetscReal pressure;
+    PetscCall(airway_.pressure(local_, pressure));
+    const PetscReal flow = (measures.volume_change - accepted_.volume * units::mm3_per_ml) / dt;
+    if (airway_.limit(flow)) *accept = PETSC_FALSE; // the step is taken again with the limit held
+  }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -385,7 +514,7 @@ PetscErrorCode Simulation::reject(PetscReal dt, const std::string &reason, Petsc
 PetscErrorCode Simulation::after_step()
 {
   Measures measures;
-  PetscReal t;
+  PetscReal t, pressure;
   SignalRow row;
   TSConvergedReason reason;
 
@@ -400,14 +529,17 @@ PetscErrorCode Simulation::after_step()
   if (crawled_ == 0) failures_.clear();
 
   // state and consistent flux of the accepted step
-  PetscCall(model_.set_step(row.dt, scene_.facts().airway_pressure(t)));
+  PetscCall(airway_.apply(state_));
   PetscCall(DMGlobalToLocal(model_.dm(), state_, INSERT_VALUES, local_));
   PetscCall(model_.constrain(t, local_));
+  PetscCall(airway_.pressure(local_, pressure));
   PetscCall(VecWAXPY(rate_, -1, before_, local_));
   PetscCall(VecScale(rate_, 1 / row.dt));
   PetscCall(model_.measure(local_, measures));
   row.volume = measures.volume_change / units::mm3_per_ml;
-  if (scene_.facts().airflow) {
+  if (airway_.mode() == Airway::Mode::free) {
+    row.flow = airway_.flow() / units::mm3_per_ml;
+  } else if (scene_.facts().airflow) {
     PetscReal flow;
     PetscCall(model_.residual(t, local_, rate_, local_residual_));
     PetscCall(model_.airway_flow(local_residual_, flow));
@@ -416,8 +548,10 @@ PetscErrorCode Simulation::after_step()
     row.flow = (row.volume - accepted_.volume) / row.dt;
   }
   PetscCall(VecCopy(local_, before_));
+  airway_.accept(measures.volume_change);
   row.time = t;
-  row.pressure = scene_.facts().airway_pressure(t) / units::kPa_per_cmH2O;
+  row.pressure = pressure / units::kPa_per_cmH2O;
+  row.ventilator_pressure = airway_.ventilator_pressure(row.flow * units::mm3_per_ml) / units::kPa_per_cmH2O;
   row.phase = phase_->name;
   row.breath = static_cast<int>(phase_->breath);
   row.newton = newton_;

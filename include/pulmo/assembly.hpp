@@ -46,6 +46,8 @@ public:
   PetscErrorCode jacobian(Part part, PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[], Mat A);
   /// J and its integral for the local vector @p x.
   PetscErrorCode measure(Vec x, Measures &measures) const;
+  /// int cof F(x) : Grad y, the derivative of int (J - 1) in direction @p y, mm^3.
+  PetscErrorCode volume_derivative(Vec x, Vec y, PetscReal &derivative) const;
 
   /// Kinematic states at the quadrature points, then the corners, of cell @p c (counted from 0).
   void point_states(PetscInt c, const PetscScalar *x, std::vector<PointState> &states) const;

@@ -13,6 +13,7 @@ namespace pulmo {
 struct SignalRow {
   double time = 0;     ///< s
   double pressure = 0; ///< airway pressure, cmH2O
+  double ventilator_pressure = 0; ///< at the machine's side of the tube, cmH2O; the airway pressure without one
   double flow = 0;     ///< ml/s, of the step that ends here
   double volume = 0;   ///< ml, int (J - 1)
   std::string phase;   ///< of the programme; the phase that ends at its last row

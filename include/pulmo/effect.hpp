@@ -10,8 +10,10 @@
 #include "pulmo/programme.hpp"
 #include "pulmo/tissue_law.hpp"
 
+#include <cmath>
 #include <functional>
 #include <memory>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -47,8 +49,8 @@ struct Constraint {
   bool component[3] = {false, false, false};
   std::string surface;            ///< empty: at @p vertices
   std::vector<PetscInt> vertices; ///< local mesh points (on every rank that has them)
-  bool at_airway = false;         ///< the condition that the ventilator steers
-  /// Value of all components at time t (s) and material point x (mm).
+  bool at_airway = false;         ///< steered by the ventilator: its pressure while it holds one, else free
+  /// Value of all components at time t (s) and material point x (mm); unused if at_airway.
   std::function<void(PetscReal t, const PetscReal x[3], PetscScalar value[3])> value;
 };
 
@@ -124,6 +126,9 @@ public:
     c.effect = effect_;
     constraints_.push_back(std::move(c));
   }
+  /// The uniform gas pressure of a lung without airflow is an unknown in some phases.
+  void solve_for_gas_pressure() { common_gas_pressure_ = true; }
+  bool common_gas_pressure() const { return common_gas_pressure_; }
 
   /// Whether anything at all holds the lung: a prescribed displacement, or a term that resists displacement itself.
   /// (It may still be too little to stop every rigid motion.)
@@ -155,18 +160,46 @@ private:
 
   const Mesh &mesh_;
   std::string effect_;
+  bool common_gas_pressure_ = false;
   std::vector<FieldSpec> fields_;
   std::vector<Term> terms_;
   std::vector<Constraint> constraints_;
   std::vector<ParameterBlock> parameters_;
 };
 
+/// Pressure lost between ventilator and airway, after Rohrer: K1 Q + K2 |Q| Q with the flow Q in mm^3/s.
+struct AirwayResistance {
+  PetscReal linear = 0;    ///< K1, kPa s/mm^3
+  PetscReal quadratic = 0; ///< K2, kPa s^2/mm^6
+
+  PetscReal drop(PetscReal flow) const { return (linear + quadratic * std::abs(flow)) * flow; }
+  PetscReal slope(PetscReal flow) const { return linear + 2 * quadratic * std::abs(flow); }
+};
+
+/// How the flow of a flow phase is shared by the airway patches.
+enum class FlowSplit {
+  uniform,        ///< the same flux through every element of area (Aviles-Rojas & Hurtado 2022, eq. 45)
+  common_pressure ///< so that all patches have one pressure, which is unknown until solved
+};
+
 /// What one effect may know of the scene beside itself.
 struct SceneFacts {
   bool airflow = false;                        ///< the pressure field exists
+  std::vector<std::string> airway_surfaces;    ///< open to the ventilator
   std::shared_ptr<const Programme> ventilator; ///< null without a ventilator
-  /// Pressure prescribed at the airway at time t, kPa (0 without a ventilator).
-  PetscReal airway_pressure(PetscReal t) const { return ventilator ? ventilator->pressure(t) : 0; }
+  FlowSplit flow_split = FlowSplit::uniform;
+  std::optional<AirwayResistance> tube; ///< between ventilator and airway
+
+  /// Whether some phase leaves the airway's pressure field free, with its flux prescribed.
+  bool free_airway() const
+  {
+    return airflow && ventilator && ventilator->prescribes_flow() && flow_split == FlowSplit::uniform;
+  }
+  /// Whether some phase has one pressure of the whole airway (without airflow: of all gas) as an unknown of its own.
+  bool common_pressure() const
+  {
+    return ventilator && (tube || (ventilator->prescribes_flow() && !free_airway()));
+  }
 };
 
 /// One physical effect.

@@ -24,25 +24,48 @@ public:
   const Assembly &assembly() const { return assembly_; }
   bool own_integration() const { return own_; }
 
-  /// Tells the kernels the step that ends at @p t: its size (s) and the airway pressure (kPa).
-  PetscErrorCode set_step(PetscReal dt, PetscReal airway_pressure);
+  /// Tells the kernels the step at hand: its size (s), the pressure held at the airway (kPa) and the flow into the lung
+  /// that is prescribed while none is held (mm^3/s).
+  PetscErrorCode set_step(PetscReal dt, PetscReal airway_pressure, PetscReal airway_flow = 0);
+  /// Whether the pressure is held on the surfaces open to the ventilator (so at the start), or free. Held nodes keep
+  /// their rows: identity in the Jacobian, zero in the residual that close_rows() leaves.
+  void hold_airway(bool held) { airway_held_ = held; }
+  bool airway_held() const { return airway_held_; }
 
   /// Writes the prescribed values of time @p t into a local vector; with @p rate also (value - @p before) / dt.
   PetscErrorCode constrain(PetscReal t, Vec local) const;
   PetscErrorCode constrain_rate(Vec local, Vec before, PetscReal dt, Vec rate) const;
 
-  /// Local residual, rows scaled. @p x and @p x_t are local vectors with constrained values in place.
+  /// Local residual, rows scaled. @p x and @p x_t are local vectors with constrained values in place. Rows of held
+  /// nodes hold the flux that enters there.
   PetscErrorCode residual(PetscReal t, Vec x, Vec x_t, Vec F);
+  /// Zeroes the rows of held nodes and of the carrier in a global residual.
+  PetscErrorCode close_rows(Vec F) const;
   /// Global Jacobian dF/dx + shift dF/dx_t, rows scaled.
   PetscErrorCode jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, Mat A);
+
+  /// The entry of a global vector that belongs to the one common pressure of the airway, where that is an unknown: a
+  /// node of the airway, or without airflow a dof of its own.
+  PetscErrorCode carrier_value(Vec X, PetscReal &value) const;
+  PetscErrorCode set_carrier_value(Vec X, PetscReal value) const;
+  /// Sets the pressure of all nodes of the airway, and of the carrier, in a global vector.
+  PetscErrorCode set_airway_nodes(Vec X, PetscReal value) const;
+  /// Mean pressure over the airway surfaces (eq. 48), kPa, from a local vector.
+  PetscErrorCode airway_mean_pressure(Vec local, PetscReal &mean) const;
   PetscErrorCode measure(Vec x, Measures &measures) const { return assembly_.measure(x, measures); }
-  /// Flow into the lung, mm^3/s: the consistent flux, from a local residual. Where p is prescribed the mass residual
+  /// d(int (J - 1))/dx in direction @p y, mm^3 (local vectors).
+  PetscErrorCode volume_derivative(Vec x, Vec y, PetscReal &derivative) const
+  {
+    return assembly_.volume_derivative(x, y, derivative);
+  }
+  /// Flow into the lung, mm^3/s: the consistent flux, from a local residual. Where p is held the mass residual
   /// is - int Q.N q; summed over the nodes where the lung is open it is exactly the rate of int (J - 1).
   PetscErrorCode airway_flow(Vec F, PetscReal &flow) const;
   /// Sum of the constrained displacement rows of a local residual: the force that supports bear, kPa mm^2.
   PetscErrorCode reaction(Vec F, PetscReal force[3]) const;
 
   PetscReal row_scale(PetscInt field) const { return row_scale_[field]; }
+  PetscReal modulus() const { return modulus_; } ///< tissue stiffness that scales the equations, kPa
 
 private:
   struct Prescribed {
@@ -52,10 +75,20 @@ private:
     PetscReal x[3]; ///< mm
   };
 
+  /// A node of the pressure field on the surfaces open to the ventilator.
+  struct AirwayNode {
+    PetscInt point, dof; ///< mesh point; offset in the local vector
+    PetscInt row;        ///< in the global vector, -1 on ranks that do not own it
+    PetscReal area;      ///< integral of its basis function over this rank's facets, mm^2
+  };
+
   PetscErrorCode create_fields();
   PetscErrorCode create_weak_form();
   PetscErrorCode create_section();
   PetscErrorCode find_constraints(std::vector<PetscInt> &constraint_of);
+  PetscErrorCode find_airway(const std::vector<PetscInt> &constraint_of);
+  PetscErrorCode find_carrier();
+  PetscErrorCode add_carrier(SectionHandle &section);
   PetscErrorCode pack_constants();
   PetscErrorCode add_volume_terms(PetscDS ds) const;
   PetscErrorCode create_stock();
@@ -68,7 +101,13 @@ private:
   VecHandle rate_, scale_;
   std::vector<Prescribed> prescribed_;
   std::vector<PetscScalar> constants_;
-  Step step_{1, 0};
+  std::vector<AirwayNode> airway_;
+  std::vector<PetscInt> closed_rows_; ///< global rows of held nodes (or of the carrier) that this rank owns
+  PetscReal airway_area_ = 0;         ///< mm^2
+  bool closes_rows_ = false, airway_held_ = true;
+  PetscInt carrier_ = -1; ///< global dof, -1 on ranks that do not own it
+  PetscMPIInt carrier_rank_ = 0;
+  Step step_{1, 0, 0};
   PetscReal modulus_ = 1;
   std::vector<PetscReal> row_scale_;
   PetscInt quadrature_degree_ = 3;

@@ -64,7 +64,8 @@ struct NoParameters {};
 struct Step {
   static constexpr const char *owner = "step";
   PetscScalar dt;           ///< size of the step, s
-  PetscScalar gas_pressure; ///< pressure prescribed at the airway, kPa
+  PetscScalar gas_pressure; ///< pressure held at the airway, kPa
+  PetscScalar airway_flux;  ///< outward flux prescribed at the airway (0 while a pressure is held), mm/s
 };
 
 /// A quadrature point as a kernel sees it.

@@ -2,6 +2,7 @@
 /// The run of a scene over time: one TSSolve per ventilator phase, step control, acceptance of steps.
 #pragma once
 
+#include "pulmo/airway.hpp"
 #include "pulmo/clinical.hpp"
 #include "pulmo/model.hpp"
 #include "pulmo/scene.hpp"
@@ -41,7 +42,7 @@ struct StageSeconds {
 
 class Simulation {
 public:
-  Simulation(const Options &options, const Scene &scene, Model &model) : options_(options), scene_(scene), model_(model)
+  Simulation(const Options &options, const Scene &scene, Model &model) : options_(options), scene_(scene), model_(model), airway_(model, scene.facts())
   {}
 
   /// Creates TS, SNES, KSP and the matrix from the options database.
@@ -66,6 +67,13 @@ public:
   // what PETSc calls back
   PetscErrorCode residual(PetscReal t, Vec X, Vec Xdot, Vec F);
   PetscErrorCode jacobian(PetscReal t, Vec X, Vec Xdot, PetscReal shift, Mat A);
+  PetscErrorCode before_stage(PetscReal t);
+  PetscErrorCode guess(Vec X) { return airway_.guess(X); }
+  /// Completes the Newton step @p Y of a solution @p X whose airway pressure is an unknown: one more right-hand side.
+  PetscErrorCode border(SNES snes, Vec X, Vec Y);
+  /// PETSc's test, but a prescribed volume must be met too.
+  PetscErrorCode converged(SNES snes, PetscInt it, PetscReal xnorm, PetscReal ynorm, PetscReal fnorm,
+                           SNESConvergedReason *reason);
   PetscErrorCode after_stage();
   PetscErrorCode accept_stage(Vec X, PetscBool *accept);
   PetscErrorCode after_step();
@@ -88,10 +96,12 @@ private:
   const Options &options_;
   const Scene &scene_;
   Model &model_;
+  Airway airway_;
   std::vector<Observer *> observers_;
   TSHandle ts_;
   MatHandle matrix_;
   VecHandle state_, local_, rate_, local_residual_, before_;
+  VecHandle border_x_, border_b_, border_z_, border_y_; ///< global; the last one local
   std::vector<Phase> phases_;
   const Phase *phase_ = nullptr;
   PetscReal wanted_dt_ = 0.05, dt_ = 0.05; ///< asked for; in use before any shortening to land on a time
@@ -100,6 +110,7 @@ private:
   std::vector<SignalRow> rows_;
   PetscReal delivered_ = 0, worst_balance_ = 0, min_J_ = 1;
   PetscInt newton_ = 0, krylov_ = 0, rejected_ = 0;
+  int extra_newton_ = 0; ///< Newton steps of the attempt at hand for the prescribed volume alone
   bool inverted_ = false; ///< the attempt at hand met J <= 0
   bool cut_ = false;      ///< the step at hand was cut
   int crawled_ = 0;       ///< accepted steps in a row that were tiny

@@ -98,8 +98,8 @@ struct DarcyKernels {
   }
 };
 
-/// Alveolar pressure field (P1, kPa), its gas stress, mass balance and Darcy flux; p is prescribed where the
-/// lung is open to the ventilator.
+/// Alveolar pressure field (P1, kPa), its gas stress, mass balance and Darcy flux. Where the lung is open the
+/// ventilator holds p or prescribes the flux.
 class Airflow final : public Effect {
 public:
   explicit Airflow(std::vector<std::unique_ptr<PermeabilityLaw>> laws) : laws_(std::move(laws)) {}
@@ -136,6 +136,7 @@ public:
   PetscErrorCode announce(SceneFacts &facts) override
   {
     facts.airflow = true;
+    facts.airway_surfaces = surfaces_;
     return PETSC_SUCCESS;
   }
 
@@ -148,7 +149,7 @@ public:
 
   void fields(Composition &c) const override { c.field("pressure", 1, 1, "kPa"); }
 
-  PetscErrorCode terms(Composition &c, const SceneFacts &facts) const override
+  PetscErrorCode terms(Composition &c, const SceneFacts &) const override
   {
     using K = AirflowKernels;
     using P = NoParameters;
@@ -176,7 +177,6 @@ public:
       open.component[0] = true;
       open.surface = surface;
       open.at_airway = true;
-      open.value = [facts](PetscReal t, const PetscReal[3], PetscScalar v[3]) { v[0] = facts.airway_pressure(t); };
       c.constrain(open);
     }
     PetscFunctionReturn(PETSC_SUCCESS);

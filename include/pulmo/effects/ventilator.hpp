@@ -1,8 +1,12 @@
 /// @file
-/// Effect `ventilator`: what the machine does at the airway over time.
+/// Effect `ventilator`: what the machine does at the airway over time (Aviles-Rojas & Hurtado 2022, sections 2.5, 2.6
+/// and 2.8).
 ///
-/// With airflow the pressure is prescribed on the open surfaces (Aviles-Rojas & Hurtado 2022, section 2.5).
-/// Without airflow the gas pressure is uniform and loads the tissue: - int p J F^-T : Grad eta.
+/// With airflow: a pressure phase holds p on the open surfaces; a flow phase prescribes the outward flux
+/// Q.N = -flow/area there (eq. 45, whose minus is lost in print), which adds int Q.N q to the mass balance, or keeps
+/// one pressure, unknown until solved, on all of them.
+/// Without airflow the gas pressure is uniform and loads the tissue: - int p J F^-T : Grad eta; in flow phases it is
+/// the unknown that goes with the prescribed volume.
 #pragma once
 
 #include "pulmo/effect.hpp"
@@ -22,49 +26,78 @@ struct UniformGasKernels {
   }
 };
 
+struct AirwayFluxKernels {
+  /// f0 of the mass row: Q.N, mm/s.
+  static void flux(const Point &point, const NoParameters &, PetscScalar f0[]) { f0[0] += point.step.airway_flux; }
+};
+
 class Ventilator final : public Effect {
 public:
   const char *name() const override { return "ventilator"; }
-  const char *about() const override { return "pressure-controlled ventilation (section 2.5)"; }
+  const char *about() const override { return "PCV, VCV, supersyringe or a programme of phases (sections 2.5, 2.6, 2.8)"; }
   bool active() const override { return mode_ != "off"; }
 
   PetscErrorCode declare(Options &options) override
   {
     PetscFunctionBeginUser;
     options.group(name(), about());
-    PetscCall(options.choice("", {"off", "pcv"}, "mode of ventilation", mode_));
-    options.group(name(), about(), active(), "-ventilator pcv");
+    PetscCall(options.choice("", {"off", "pcv", "vcv", "supersyringe", "programme"}, "mode of ventilation", mode_));
+    const bool pcv = mode_ == "pcv", vcv = mode_ == "vcv", syringe = mode_ == "supersyringe";
+    if (vcv) {
+      pause_ = 0.25;
+      ramp_ = 0;
+    }
+    if (syringe) {
+      inspiration_ = 0.3;
+      pause_ = 2;
+    }
+
+    options.group(name(), "pressure control", pcv, "-ventilator pcv");
     PetscCall(options.real("pip", "cmH2O", Range::any(), "peak inspiratory pressure above atmospheric", pip_));
+    options.group(name(), "volume control", vcv, "-ventilator vcv");
+    PetscCall(options.real("tidal_volume", "ml", Range::positive(), "volume of one inspiration, of the whole mesh",
+                           tidal_volume_));
+    options.group(name(), "supersyringe", syringe, "-ventilator supersyringe");
+    PetscCall(options.whole("steps", "-", Range::between(1, 100000), "steps of inflation, and as many of deflation",
+                            steps_));
+    PetscCall(options.real("step_volume", "ml", Range::positive(), "volume of one step", step_volume_));
+    options.group(name(), "pressure and volume control", pcv || vcv, "-ventilator pcv or vcv");
     PetscCall(options.real("peep", "cmH2O", Range::any(), "positive end-expiratory pressure", peep_));
-    PetscCall(options.real("inspiration", "s", Range::positive(), "duration of inspiration", inspiration_));
-    PetscCall(options.real("pause", "s", Range::not_negative(), "duration of the end-inspiratory pause", pause_));
     PetscCall(options.real("expiration", "s", Range::positive(), "duration of expiration", expiration_));
-    PetscCall(options.real("ramp", "s", Range::not_negative(), "rise of pressure at the start of inspiration", ramp_));
+    PetscCall(options.real("ramp", "s", Range::not_negative(),
+                           "rise of pressure (vcv, default 0: of flow) at the start of inspiration", ramp_));
     PetscCall(options.real("ramp_down", "s", Range::not_negative(),
                            "fall of pressure at the start of expiration (0: from the first step)", ramp_down_));
-    PetscCall(options.whole("breaths", "-", Range::between(1, 100000), "number of breaths", breaths_));
+    options.group(name(), "all but programme", pcv || vcv || syringe, "-ventilator pcv, vcv or supersyringe");
+    PetscCall(options.real("inspiration", "s", Range::positive(),
+                           "duration of inspiration (supersyringe, default 0.3: of the flow of a step)", inspiration_));
+    PetscCall(options.real("pause", "s", Range::not_negative(),
+                           "duration of the end-inspiratory pause (default: pcv 0, vcv 0.25, supersyringe 2 after "
+                           "each step)",
+                           pause_));
+    PetscCall(options.whole("breaths", "-", Range::between(1, 100000), "number of breaths (supersyringe: manoeuvres)",
+                            breaths_));
+    options.group(name(), "programme", mode_ == "programme", "-ventilator programme");
+    PetscCall(options.text("programme", "file of phases (docs/ventilator.md)", file_));
+    options.group(name(), "prescribed flow", active() && !pcv, "-ventilator vcv, supersyringe or programme");
+    PetscCall(options.choice("flow_split", {"uniform", "common_pressure"},
+                             "how patches of airway share a prescribed flow: by area, or so that they have one pressure",
+                             split_));
+
+    PetscCall(check_settings(options));
+    if (mode_ == "programme") {
+      PulmoUserCheck(!file_.empty(), options.comm(),
+                     "-ventilator programme needs -ventilator_programme FILE (docs/ventilator.md shows how to write it)");
+      PetscCall(read_programme(options.comm(), "-ventilator_programme", file_, read_));
+    }
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
   PetscErrorCode announce(SceneFacts &facts) override
   {
     facts.ventilator = std::make_shared<Programme>(programme());
+    facts.flow_split = split_ == "uniform" ? FlowSplit::uniform : FlowSplit::common_pressure;
     return PETSC_SUCCESS;
-  }
-
-  PetscErrorCode check(const Options &options, const Mesh &, const SceneFacts &) override
-  {
-    PetscFunctionBeginUser;
-    PulmoUserCheck(ramp_ <= inspiration_, options.comm(),
-                   "-ventilator_ramp %g s is longer than -ventilator_inspiration %g s; shorten the ramp", (double)ramp_,
-                   (double)inspiration_);
-    PulmoUserCheck(ramp_down_ <= expiration_, options.comm(),
-                   "-ventilator_ramp_down %g s is longer than -ventilator_expiration %g s; shorten the ramp",
-                   (double)ramp_down_, (double)expiration_);
-    PulmoUserCheck(pip_ >= peep_, options.comm(),
-                   "-ventilator_pip %g cmH2O is below -ventilator_peep %g cmH2O; raise pip or lower peep", (double)pip_,
-                   (double)peep_);
-    PetscFunctionReturn(PETSC_SUCCESS);
   }
 
   PetscErrorCode terms(Composition &c, const SceneFacts &facts) const override
@@ -77,36 +110,66 @@ public:
       c.residual("-J p F^-T : Grad eta", displacement, nullptr, volume_residual<P, K::gas_stress>);
       c.jacobian("gas stress", displacement, displacement, nullptr, nullptr, nullptr,
                  volume_jacobian<P, K::gas_stress_by_displacement>);
+      if (facts.common_pressure()) c.solve_for_gas_pressure();
     }
+    if (facts.free_airway())
+      for (const std::string &surface : facts.airway_surfaces)
+        c.surface_residual("Q.N q", surface, pressure, surface_residual<P, AirwayFluxKernels::flux>, nullptr);
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
-  /// The phases: with PEEP first `settle` (0 -> PEEP), then inspiration, pause, expiration of each breath.
+  /// The phases. With PEEP first `settle` (0 -> PEEP).
   Programme programme() const
   {
-    const PetscReal pip = pip_ * units::kPa_per_cmH2O, peep = peep_ * units::kPa_per_cmH2O;
-    std::vector<Phase> phases;
-    PetscReal t = 0;
-    const auto add = [&](const char *name, PetscInt breath, PetscReal duration, PetscReal from, PetscReal to,
-                         PetscReal ramp) {
-      phases.push_back({name, breath, t, t + duration, from, to, ramp});
-      t += duration;
-    };
-    if (peep_ != 0) add("settle", 0, ramp_ + expiration_, 0, peep, ramp_);
-    for (PetscInt b = 1; b <= breaths_; ++b) {
-      add("inspiration", b, inspiration_, peep, pip, ramp_);
-      if (pause_ > 0) add("pause", b, pause_, pip, pip, 0);
-      add("expiration", b, expiration_, pip, peep, ramp_down_);
+    if (mode_ == "programme") return Programme(read_);
+    ProgrammeBuilder b;
+    for (PetscInt breath = 1; breath <= breaths_; ++breath) {
+      if (mode_ == "supersyringe") {
+        const PetscReal flow = step_volume_ / inspiration_;
+        for (PetscInt step = 0; step < 2 * steps_; ++step) {
+          const bool up = step < steps_;
+          b.add(up ? "inflation" : "deflation", breath, inspiration_, Control::flow, up ? flow : -flow);
+          if (pause_ > 0) b.add("pause", breath, pause_, Control::flow, 0);
+        }
+        continue;
+      }
+      if (breath == 1 && peep_ != 0) b.add("settle", 0, ramp_ + expiration_, Control::pressure, peep_, ramp_);
+      const bool vcv = mode_ == "vcv";
+      if (vcv) // a ramp takes half its length from the plateau of flow
+        b.add("inspiration", breath, inspiration_, Control::flow, tidal_volume_ / (inspiration_ - ramp_ / 2), ramp_);
+      else
+        b.add("inspiration", breath, inspiration_, Control::pressure, pip_, ramp_);
+      if (pause_ > 0) b.add("pause", breath, pause_, vcv ? Control::flow : Control::pressure, vcv ? 0 : pip_);
+      b.add("expiration", breath, expiration_, Control::pressure, peep_, ramp_down_);
     }
-    return Programme(std::move(phases));
+    return Programme(b.take());
   }
   /// cmH2O.
   PetscReal peep() const { return peep_; }
 
 private:
-  std::string mode_ = "off";
-  PetscReal pip_ = 6, peep_ = 0, inspiration_ = 1, pause_ = 0, expiration_ = 2, ramp_ = 0.1, ramp_down_ = 0;
-  PetscInt breaths_ = 1;
+  /// Settings that contradict one another.
+  PetscErrorCode check_settings(const Options &options) const
+  {
+    PetscFunctionBeginUser;
+    if (mode_ != "pcv" && mode_ != "vcv") PetscFunctionReturn(PETSC_SUCCESS);
+    PulmoUserCheck(ramp_ <= inspiration_, options.comm(),
+                   "-ventilator_ramp %g s is longer than -ventilator_inspiration %g s; shorten the ramp", (double)ramp_,
+                   (double)inspiration_);
+    PulmoUserCheck(ramp_down_ <= expiration_, options.comm(),
+                   "-ventilator_ramp_down %g s is longer than -ventilator_expiration %g s; shorten the ramp",
+                   (double)ramp_down_, (double)expiration_);
+    PulmoUserCheck(mode_ == "vcv" || pip_ >= peep_, options.comm(),
+                   "-ventilator_pip %g cmH2O is below -ventilator_peep %g cmH2O; raise pip or lower peep", (double)pip_,
+                   (double)peep_);
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+  std::string mode_ = "off", file_, split_ = "uniform";
+  PetscReal pip_ = 6, peep_ = 0, tidal_volume_ = 500, step_volume_ = 100;
+  PetscReal inspiration_ = 1, pause_ = 0, expiration_ = 2, ramp_ = 0.1, ramp_down_ = 0;
+  PetscInt breaths_ = 1, steps_ = 8;
+  std::vector<Phase> read_;
 };
 
 } // namespace pulmo

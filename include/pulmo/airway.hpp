@@ -1,0 +1,66 @@
+/// @file
+/// The condition at the airway: what the phase at hand prescribes there, and the one equation that goes with a pressure
+/// that is an unknown of its own.
+#pragma once
+
+#include "pulmo/model.hpp"
+
+namespace pulmo {
+
+/// Steers the airway of a model through the phases of a programme.
+///
+/// held    the pressure is prescribed on the open surfaces;
+/// free    the flux is prescribed there, by area, and the pressure field is free;
+/// common  the whole airway (without airflow: all gas) has one pressure P, the unknown of one scalar equation c = 0:
+///         a prescribed volume, (V - V_target) / h^3, or the tube's drop, (P + K1 Q + K2 |Q| Q - P_ventilator) / modulus.
+///
+/// A flow phase prescribes the volume at the end of each step, so that errors of the solver do not add up.
+class Airway {
+public:
+  enum class Mode { held, free, common };
+
+  Airway(Model &model, const SceneFacts &facts) : model_(model), facts_(facts) {}
+
+  /// Begins a phase at lung volume @p volume (mm^3 above rest).
+  void begin_phase(const Phase &phase, PetscReal volume);
+  /// Begins an attempt at a step of size @p dt that ends at @p t, s.
+  void begin_step(PetscReal t, PetscReal dt);
+  /// Puts the prescribed pressure, or the last known one, into a global vector.
+  PetscErrorCode guess(Vec X) const;
+  /// Hands the step to the model; where P is an unknown its value is that of @p X.
+  PetscErrorCode apply(Vec X);
+  /// Writes the scalar equation at lung volume @p volume into its row of a global residual.
+  PetscErrorCode close(PetscReal volume, Vec F);
+  /// Change of P in a Newton step, kPa, from the equation's value @p c, its derivative @p c_P and the changes of
+  /// volume (mm^3) along the step for fixed P and per kPa.
+  PetscReal change(PetscReal c, PetscReal c_P, PetscReal volume_fixed, PetscReal volume_per_P) const;
+  /// Whether the volume of a flow phase was met when close() was called last.
+  bool satisfied() const;
+  /// Takes note of an accepted step that ended at @p volume, mm^3.
+  void accept(PetscReal volume) { volume_before_ = volume; }
+  /// Pressure at the airway, kPa: what is held, the unknown, or the mean over the free surface.
+  PetscErrorCode pressure(Vec local, PetscReal &pressure);
+  /// Pressure at the ventilator's side of the tube, kPa, at flow @p flow into the lung, mm^3/s.
+  PetscReal ventilator_pressure(PetscReal flow) const { return pressure_ + (facts_.tube ? facts_.tube->drop(flow) : 0); }
+  /// If the phase has a limit that the ventilator's pressure exceeds: holds the limit from now on and tells so.
+  bool limit(PetscReal flow);
+
+  Mode mode() const { return mode_; }
+  /// Flow prescribed in the step at hand, mm^3/s.
+  PetscReal flow() const { return (volume_target_ - volume_before_) / dt_; }
+
+private:
+  void set_mode();
+
+  Model &model_;
+  const SceneFacts &facts_;
+  Phase phase_;
+  Mode mode_ = Mode::held;
+  PetscReal pressure_ = 0;                           ///< at the airway, kPa
+  PetscReal target_ = 0;                             ///< pressure that the phase prescribes, kPa
+  PetscReal volume_begin_ = 0, volume_before_ = 0;   ///< at the begin of the phase, of the step, mm^3
+  PetscReal volume_target_ = 0, volume_ = 0;         ///< prescribed; at the last close(), mm^3
+  PetscReal dt_ = 1;
+};
+
+} // namespace pulmo

@@ -1,0 +1,107 @@
+#include "pulmo/airway.hpp"
+
+#include "pulmo/mesh.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+namespace pulmo {
+
+namespace {
+
+/// A prescribed volume is met to this share of itself (or of a thousandth of the lung's, if that is more).
+constexpr PetscReal volume_tolerance = 1e-10;
+
+} // namespace
+
+void Airway::begin_phase(const Phase &phase, PetscReal volume)
+{
+  phase_ = phase;
+  if (!phase_.from) phase_.from = pressure_;
+  volume_begin_ = volume_before_ = volume;
+  set_mode();
+}
+
+void Airway::set_mode()
+{
+  if (phase_.control == Control::flow)
+    mode_ = facts_.free_airway() ? Mode::free : Mode::common;
+  else
+    mode_ = facts_.tube ? Mode::common : Mode::held;
+}
+
+void Airway::begin_step(PetscReal t, PetscReal dt)
+{
+  dt_ = dt;
+  if (phase_.control == Control::flow)
+    volume_target_ = volume_begin_ + phase_.delivered(t);
+  else
+    target_ = phase_.value(t);
+  if (mode_ == Mode::held) pressure_ = target_;
+}
+
+PetscErrorCode Airway::guess(Vec X) const
+{
+  PetscFunctionBeginUser;
+  if (mode_ != Mode::free) PetscCall(model_.set_airway_nodes(X, pressure_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Airway::apply(Vec X)
+{
+  PetscFunctionBeginUser;
+  if (mode_ == Mode::common) PetscCall(model_.carrier_value(X, pressure_));
+  model_.hold_airway(mode_ != Mode::free);
+  PetscCall(model_.set_step(dt_, pressure_, mode_ == Mode::free ? flow() : 0));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Airway::close(PetscReal volume, Vec F)
+{
+  PetscFunctionBeginUser;
+  volume_ = volume;
+  PetscCall(model_.close_rows(F));
+  if (mode_ == Mode::common) {
+    const PetscReal h = model_.composition().mesh().length(), Q = (volume - volume_before_) / dt_;
+    const PetscReal c = phase_.control == Control::flow ? (volume - volume_target_) / (h * h * h)
+                                                        : (ventilator_pressure(Q) - target_) / model_.modulus();
+    PetscCall(model_.set_carrier_value(F, c));
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscReal Airway::change(PetscReal c, PetscReal c_P, PetscReal volume_fixed, PetscReal volume_per_P) const
+{
+  const PetscReal h = model_.composition().mesh().length();
+  const PetscReal c_V = phase_.control == Control::flow
+                            ? 1 / (h * h * h)
+                            : facts_.tube->slope((volume_ - volume_before_) / dt_) / (dt_ * model_.modulus());
+  return -(c + c_V * volume_fixed) / (c_P + c_V * volume_per_P);
+}
+
+bool Airway::satisfied() const
+{
+  if (phase_.control != Control::flow) return true;
+  const PetscReal scale = std::max(std::abs(volume_target_), PetscReal(1e-3) * model_.composition().mesh().volume());
+  return std::abs(volume_ - volume_target_) <= volume_tolerance * scale;
+}
+
+PetscErrorCode Airway::pressure(Vec local, PetscReal &pressure)
+{
+  PetscFunctionBeginUser;
+  if (mode_ == Mode::free) PetscCall(model_.airway_mean_pressure(local, pressure_));
+  pressure = pressure_;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+bool Airway::limit(PetscReal flow)
+{
+  if (!phase_.limit || ventilator_pressure(flow) <= *phase_.limit) return false;
+  phase_.control = Control::pressure;
+  phase_.from = phase_.to = *phase_.limit;
+  phase_.limit.reset();
+  set_mode();
+  return true;
+}
+
+} // namespace pulmo
