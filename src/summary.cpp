@@ -17,19 +17,64 @@ Json optional_json(const std::optional<double> &v)
   return v ? Json(*v) : Json(nullptr);
 }
 
-void add_numbers(Json &json, const ClinicalNumbers &n)
+/// One number of a breath: its key in summary.json, how it is printed, and its value.
+struct Entry {
+  const char *key, *label, *unit;
+  std::optional<double> value;
+};
+
+/// All numbers of a breath in the order of the table. @p frc: gas volume at rest, ml.
+std::vector<Entry> entries(const ClinicalNumbers &n, const std::optional<double> &frc)
 {
-  json["compliance_ml_per_cmH2O"] = optional_json(n.compliance);
-  json["resistance_cmH2O_s_per_l"] = optional_json(n.resistance);
-  json["time_constant_s"] = optional_json(n.time_constant);
-  json["peak_inspiratory_pressure_cmH2O"] = n.peak_pressure;
-  json["plateau_pressure_cmH2O"] = optional_json(n.plateau_pressure);
-  json["driving_pressure_cmH2O"] = n.driving_pressure;
-  json["tidal_volume_ml"] = n.tidal_volume;
-  json["trapped_volume_ml"] = n.trapped_volume;
-  json["peak_flow_ml_per_s"] = n.peak_flow;
-  json["work_j"] = n.work;
-  json["mechanical_power_j_per_min"] = n.mechanical_power;
+  const auto strain = frc ? std::optional<double>(n.tidal_volume / *frc) : std::nullopt;
+  return {
+      {"peak_inspiratory_pressure_cmH2O", "peak inspiratory pressure", "cmH2O", n.peak_pressure},
+      {"plateau_pressure_cmH2O", "plateau pressure", "cmH2O", n.plateau_pressure},
+      {"peep_cmH2O", "PEEP", "cmH2O", n.peep},
+      {"auto_peep_cmH2O", "auto-PEEP", "cmH2O", n.auto_peep},
+      {"total_peep_cmH2O", "total PEEP", "cmH2O", n.total_peep},
+      {"driving_pressure_cmH2O", "driving pressure", "cmH2O", n.driving_pressure},
+      {"tidal_volume_ml", "tidal volume", "ml", n.tidal_volume},
+      {"trapped_volume_ml", "trapped volume", "ml", n.trapped_volume},
+      {"peak_flow_ml_per_s", "peak inspiratory flow", "ml/s", n.peak_flow},
+      {"peak_expiratory_flow_ml_per_s", "peak expiratory flow", "ml/s", n.peak_expiratory_flow},
+      {"compliance_ml_per_cmH2O", "compliance C_rs (fit)", "ml/cmH2O", n.compliance},
+      {"resistance_cmH2O_s_per_l", "resistance R (fit)", "cmH2O s/l", n.resistance},
+      {"time_constant_s", "time constant R C_rs", "s", n.time_constant},
+      {"static_compliance_ml_per_cmH2O", "static compliance", "ml/cmH2O", n.static_compliance},
+      {"dynamic_compliance_ml_per_cmH2O", "dynamic compliance", "ml/cmH2O", n.dynamic_compliance},
+      {"static_curve_compliance_ml_per_cmH2O", "slope of the static curve", "ml/cmH2O", n.static_curve_compliance},
+      {"pause_resistance_cmH2O_s_per_l", "resistance from the pause", "cmH2O s/l", n.pause_resistance},
+      {"work_j", "work of (P - PEEP)", "J", n.work},
+      {"mechanical_power_j_per_min", "mechanical power", "J/min", n.mechanical_power},
+      {"strain", "strain V_T/FRC", "", strain},
+  };
+}
+
+void add_numbers(Json &json, const ClinicalNumbers &n, const std::optional<double> &frc)
+{
+  for (const Entry &e : entries(n, frc)) json[e.key] = optional_json(e.value);
+}
+
+/// Gas volume at rest, ml: Phi0 V0 (empty without airflow, where no porosity is given).
+std::optional<double> functional_residual_capacity(const Scene &scene)
+{
+  if (!scene.facts().airflow) return std::nullopt;
+  return scene.airflow().porosity() * scene.mesh().volume() / units::mm3_per_ml;
+}
+
+/// The end of every pause of the run.
+Json static_curve(const std::vector<SignalRow> &rows)
+{
+  Json curve = Json::array();
+  for (const StaticPoint &point : static_points(rows, 0, rows.size() - 1)) {
+    const SignalRow &r = rows[point.row];
+    curve.push_back({{"time_s", r.time},
+                     {"phase", point.phase},
+                     {"volume_ml", r.volume},
+                     {"pressure_cmH2O", r.machine_pressure()}});
+  }
+  return curve;
 }
 
 } // namespace
@@ -53,14 +98,17 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
     Json json;
     json["finished"] = finished;
     if (!finished) json["failure"] = simulation.failure_text();
+    const auto frc = functional_residual_capacity(scene);
     if (scene.facts().ventilator) {
-      add_numbers(json, overall_numbers(simulation.rows(), scene.ventilator().peep()));
+      add_numbers(json, overall_numbers(simulation.rows()), frc);
+      json["static_curve"] = static_curve(simulation.rows());
       json["breaths"] = Json::array();
-      for (const ClinicalNumbers &n : breath_numbers(simulation.rows(), scene.ventilator().peep())) {
+      for (const ClinicalNumbers &n : breath_numbers(simulation.rows())) {
         json["breaths"].emplace_back();
-        add_numbers(json["breaths"].back(), n);
+        add_numbers(json["breaths"].back(), n, frc);
       }
     }
+    json["functional_residual_capacity_ml"] = optional_json(frc);
     json["reference_volume_ml"] = scene.mesh().volume() / units::mm3_per_ml;
     PetscReal total = 0;
     Json areas;
@@ -115,22 +163,13 @@ PetscErrorCode print_numbers(MPI_Comm comm, const Output &output, const Scene &s
 {
   PetscFunctionBeginUser;
   if (scene.facts().ventilator) {
-    const ClinicalNumbers n = overall_numbers(simulation.rows(), scene.ventilator().peep());
-    PetscCall(
-        PetscPrintf(comm,
-                    "\nThe lung (%.0f ml at rest, %s tissue) took %.1f ml per breath at a peak airway pressure of "
-                    "%.2f cmH2O; %.1f ml stayed behind.\n",
-                    (double)(scene.mesh().volume() / units::mm3_per_ml), scene.tissue().law().name(), n.tidal_volume,
-                    n.peak_pressure, n.trapped_volume));
-    if (n.compliance)
-      PetscCall(PetscPrintf(comm,
-                            "Respiratory-system compliance %.2f ml/cmH2O, resistance %.3f cmH2O s/l, time constant "
-                            "%.3f s (single-compartment fit).\n",
-                            *n.compliance, *n.resistance, *n.time_constant));
     PetscCall(PetscPrintf(comm,
-                          "Driving pressure %.2f cmH2O, peak flow %.0f ml/s, work %.4f J per breath, mechanical power "
-                          "%.3f J/min.\n",
-                          n.driving_pressure, n.peak_flow, n.work, n.mechanical_power));
+                          "\n%s tissue, %.0f ml at rest: clinical numbers of the last breath (fits over all breaths)\n",
+                          scene.tissue().law().name(), (double)(scene.mesh().volume() / units::mm3_per_ml)));
+    for (const Entry &e : entries(overall_numbers(simulation.rows()), functional_residual_capacity(scene))) {
+      if (!e.value) continue;
+      PetscCall(PetscPrintf(comm, "  %-28s %12.4g %s\n", e.label, *e.value, e.unit));
+    }
   }
   PetscCall(PetscPrintf(comm, "Smallest J %.4f", (double)simulation.min_J()));
   if (scene.facts().airflow)

@@ -23,6 +23,8 @@ PIP, PEEP, INSPIRATION, PAUSE, EXPIRATION, RAMP, RAMP_DOWN, BREATHS, DT = 7.0, 2
 BREATHING = ["-ventilator_pip", PIP, "-ventilator_peep", PEEP, "-ventilator_inspiration", INSPIRATION,
              "-ventilator_pause", PAUSE, "-ventilator_expiration", EXPIRATION, "-ventilator_ramp", RAMP,
              "-ventilator_ramp_down", RAMP_DOWN, "-ventilator_breaths", BREATHS, "-ts_dt", DT]
+# numbers of a breath that need the alveolar pressure
+NUMBERS_OF_FIELDS = {"auto_peep_cmH2O", "total_peep_cmH2O", "static_compliance_ml_per_cmH2O"}
 # slow enough to leave some gas behind
 GAS = ["-airflow_permeability", "300"]
 
@@ -185,14 +187,32 @@ class Breaths(unittest.TestCase):
                 "peak_inspiratory_pressure_cmH2O": P.max(), "plateau_pressure_cmH2O": plateau,
                 "driving_pressure_cmH2O": plateau - PEEP, "tidal_volume_ml": V.max() - V[0],
                 "trapped_volume_ml": V[-1] - V[0], "peak_flow_ml_per_s": Q[1:].max(), "work_j": work,
-                "mechanical_power_j_per_min": work * 60 / (INSPIRATION + PAUSE + EXPIRATION)}
-            self.assertEqual(set(n), set(expected))
+                "mechanical_power_j_per_min": work * 60 / (INSPIRATION + PAUSE + EXPIRATION), "peep_cmH2O": PEEP,
+                "peak_expiratory_flow_ml_per_s": -Q[1:].min(),
+                "dynamic_compliance_ml_per_cmH2O": (V.max() - V[0]) / (PIP - PEEP), "strain": (V.max() - V[0]) / 0.99,
+                "pause_resistance_cmH2O_s_per_l": None, "static_curve_compliance_ml_per_cmH2O": None}
+            self.assertEqual(set(n), set(expected) | NUMBERS_OF_FIELDS)
             for name, value in expected.items():
-                self.assertAlmostEqual(n[name], value, delta=1e-9 * max(1, abs(value)), msg=name)
+                if value is None:
+                    self.assertIsNone(n[name], name)
+                else:
+                    self.assertAlmostEqual(n[name], value, delta=1e-9 * max(1, abs(value)), msg=name)
         last = self.summary["breaths"][-1]
         for name in set(last) - {"compliance_ml_per_cmH2O", "resistance_cmH2O_s_per_l", "time_constant_s"}:
             self.assertEqual(self.summary[name], last[name], name)
         self.assertGreater(abs(self.summary["breaths"][0]["trapped_volume_ml"]), 1e-6)
+
+    def test_static_curve(self):
+        """The end of each pause, with the phase that it follows."""
+        curve = self.summary["static_curve"]
+        ends = [(p[3], before[0]) for before, p in zip(schedule(), schedule()[1:]) if p[0] == "pause"]
+        self.assertEqual([point["phase"] for point in curve], [name for _, name in ends])
+        for point, (end, _) in zip(curve, ends):
+            row = int(np.abs(self.rows["time_s"] - end).argmin())
+            self.assertEqual(set(point), {"time_s", "phase", "volume_ml", "pressure_cmH2O"})
+            self.assertAlmostEqual(point["time_s"], end, places=9)
+            self.assertAlmostEqual(point["volume_ml"], self.rows["volume_ml"][row], places=12)
+            self.assertAlmostEqual(point["pressure_cmH2O"], PIP, places=9)
 
     def test_summary_keys(self):
         s = self.summary
@@ -317,9 +337,10 @@ class Breaths(unittest.TestCase):
             self.assertNotIn(word, text)
 
     def test_numbers_in_words(self):
-        for number in (f"{self.summary['compliance_ml_per_cmH2O']:.2f} ml/cmH2O",
-                       f"{self.summary['resistance_cmH2O_s_per_l']:.3f} cmH2O s/l",
-                       f"{self.summary['tidal_volume_ml']:.1f} ml", self.case.path("summary.json"),
+        self.assertAlmostEqual(self.summary["functional_residual_capacity_ml"], 0.99, places=9)
+        for number in (f"{self.summary['compliance_ml_per_cmH2O']:.4g} ml/cmH2O",
+                       f"{self.summary['resistance_cmH2O_s_per_l']:.4g} cmH2O s/l",
+                       f"{self.summary['tidal_volume_ml']:.4g} ml", self.case.path("summary.json"),
                        self.case.path("signals.csv"), self.case.path("fields.xdmf")):
             self.assertIn(number, self.case.out)
 
