@@ -67,7 +67,7 @@ PetscErrorCode Output::prepare(const Options &options)
   if (rank == 0) { // what an earlier run left must not pass for this one's
     std::error_code error;
     for (const char *old :
-         {"summary.json", "failure.json", "signals.csv", "signals.csv.part", "fields.xdmf", "fields.h5"})
+         {"summary.json", "failure.json", "signals.csv", "signals.csv.part", "energy.csv", "fields.xdmf", "fields.h5"})
       fs::remove(path(old), error);
     for (const auto &entry : fs::directory_iterator(directory_, error)) {
       const std::string name = entry.path().filename().string();

@@ -77,16 +77,84 @@ Json static_curve(const std::vector<SignalRow> &rows)
   return curve;
 }
 
+/// Rows of the balance with their signs as listed.
+Json energy_json(const EnergyAudit &audit, const EnergyBalance &balance)
+{
+  Json json;
+  json["ventilator_work"] = balance.ventilator_work;
+  for (std::size_t i = 0; i < balance.accounts.size(); ++i) json[audit.accounts()[i].name] = balance.accounts[i];
+  json["residual"] = balance.residual;
+  json["residual_relative"] = balance.relative_residual();
+  return json;
+}
+
+/// The rows that regions are compared at: those of the last breath, or of the whole run without one.
+BreathRows last_breath(const std::vector<SignalRow> &rows)
+{
+  const auto breaths = breath_rows(rows);
+  return breaths.empty() ? BreathRows{0, rows.size() - 1, rows.size() - 1} : breaths.back();
+}
+
+/// What a region took in during a breath, ml.
+double ventilation(const RegionAudit &audit, const BreathRows &breath, std::size_t region)
+{
+  return audit.state(breath.fullest, region).volume_change - audit.state(breath.first, region).volume_change;
+}
+
+/// The same as a share of the whole lung's.
+std::optional<double> ventilation_share(const RegionAudit &audit, const BreathRows &breath, std::size_t region)
+{
+  const double whole = ventilation(audit, breath, audit.regions().size());
+  return whole != 0 ? std::optional<double>(ventilation(audit, breath, region) / whole) : std::nullopt;
+}
+
+Json regions_json(const RegionAudit &audit, const BreathRows &breath, bool gas)
+{
+  Json json = Json::object();
+  for (std::size_t r = 0; r < audit.regions().size(); ++r) {
+    const RegionState &s = audit.state(breath.fullest, r);
+    const auto pressure_json = [gas](double p) { return gas ? Json(p) : Json(nullptr); };
+    json[audit.regions()[r].name] = {{"connected_body", audit.regions()[r].body},
+                                     {"reference_volume_ml", audit.volume(r)},
+                                     {"ventilation_ml", ventilation(audit, breath, r)},
+                                     {"ventilation_share", optional_json(ventilation_share(audit, breath, r))},
+                                     {"jacobian_mean", s.mean_J},
+                                     {"jacobian_sd", s.sd_J},
+                                     {"alveolar_pressure_mean_cmH2O", pressure_json(s.mean_pressure)},
+                                     {"alveolar_pressure_sd_cmH2O", pressure_json(s.sd_pressure)}};
+  }
+  return json;
+}
+
+/// Gives a file that was written under a temporary name its own; an error on all ranks if that or the writing failed.
+PetscErrorCode finish_file(MPI_Comm comm, std::ofstream &f, const std::string &file)
+{
+  PetscMPIInt rank;
+  int written = 1;
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  if (rank == 0) {
+    std::error_code error;
+    f.close();
+    if (f.good()) std::filesystem::rename(file + ".part", file, error);
+    written = f.good() && !error;
+  }
+  PetscCallMPI(MPI_Bcast(&written, 1, MPI_INT, 0, comm));
+  PulmoUserCheck(written, comm, "cannot write %s; free the disk or choose another -output_dir", file.c_str());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 } // namespace
 
 PetscErrorCode write_summary(const Options &options, const Output &output, const Scene &scene, const Model &model,
-                             const Simulation &simulation, bool finished)
+                             const Simulation &simulation, const Audits &audits, bool finished)
 {
   const MPI_Comm comm = options.comm();
   PetscMPIInt rank, size;
   PetscInt dofs;
   std::vector<std::pair<std::string, std::string>> used;
-  int written = 1;
+  std::ofstream f;
 
   PetscFunctionBeginUser;
   PetscCallMPI(MPI_Comm_rank(comm, &rank));
@@ -99,15 +167,25 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
     json["finished"] = finished;
     if (!finished) json["failure"] = simulation.failure_text();
     const auto frc = functional_residual_capacity(scene);
+    const std::vector<SignalRow> rows = audits.regions.complete(simulation.rows());
     if (scene.facts().ventilator) {
-      add_numbers(json, overall_numbers(simulation.rows()), frc);
-      json["static_curve"] = static_curve(simulation.rows());
+      add_numbers(json, overall_numbers(rows), frc);
+      json["static_curve"] = static_curve(rows);
       json["breaths"] = Json::array();
-      for (const ClinicalNumbers &n : breath_numbers(simulation.rows())) {
-        json["breaths"].emplace_back();
-        add_numbers(json["breaths"].back(), n, frc);
+      for (const BreathRows &b : breath_rows(rows)) {
+        Json breath;
+        add_numbers(breath, clinical_numbers(rows, b.first, b.last), frc);
+        if (audits.energy) {
+          const auto &energy = audits.energy->rows();
+          breath["energy_j"] = energy_json(*audits.energy, energy[b.last] - energy[b.first]);
+          breath["inspiratory_energy_j"] = energy_json(*audits.energy, energy[b.fullest] - energy[b.first]);
+        }
+        json["breaths"].push_back(breath);
       }
     }
+    if (audits.energy) json["energy_j"] = energy_json(*audits.energy, audits.energy->rows().back());
+    const bool gas = scene.facts().airflow || scene.facts().ventilator;
+    json["regions"] = regions_json(audits.regions, last_breath(rows), gas);
     json["functional_residual_capacity_ml"] = optional_json(frc);
     json["reference_volume_ml"] = scene.mesh().volume() / units::mm3_per_ml;
     PetscReal total = 0;
@@ -146,32 +224,96 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
     for (const auto &[name, value] : used) list[name] = value;
     json["options"] = list;
 
-    const std::string part = file + ".part";
-    std::ofstream f(part);
+    f.open(file + ".part");
     f << json.dump(2, ' ', false, Json::error_handler_t::replace) << "\n";
-    f.close();
-    std::error_code error;
-    if (f.good()) std::filesystem::rename(part, file, error);
-    written = f.good() && !error;
   }
-  PetscCallMPI(MPI_Bcast(&written, 1, MPI_INT, 0, comm));
-  PulmoUserCheck(written, comm, "cannot write %s; free the disk or choose another -output_dir", file.c_str());
+  PetscCall(finish_file(comm, f, file));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode print_numbers(MPI_Comm comm, const Output &output, const Scene &scene, const Simulation &simulation)
+PetscErrorCode write_energy(MPI_Comm comm, const Output &output, const Simulation &simulation, const EnergyAudit &audit)
 {
+  const std::string file = output.path("energy.csv");
+  PetscMPIInt rank;
+  std::ofstream f;
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  if (rank == 0) {
+    f.open(file + ".part");
+    f.precision(15);
+    f << "time_s,ventilator_work_j";
+    for (const EnergyAccount &a : audit.accounts()) f << "," << a.name << "_j";
+    f << ",residual_j\n";
+    for (std::size_t i = 0; i < audit.rows().size(); ++i) {
+      const EnergyBalance &b = audit.rows()[i];
+      f << simulation.rows()[i].time << "," << b.ventilator_work;
+      for (double a : b.accounts) f << "," << a;
+      f << "," << b.residual << "\n";
+    }
+  }
+  PetscCall(finish_file(comm, f, file));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+namespace {
+
+/// The balance of the last breath, beside that of its filling.
+PetscErrorCode print_energy(MPI_Comm comm, const EnergyAudit &audit, const BreathRows &breath)
+{
+  const EnergyBalance whole = audit.rows()[breath.last] - audit.rows()[breath.first],
+                      filling = audit.rows()[breath.fullest] - audit.rows()[breath.first];
+  const auto line = [comm](const std::string &name, double a, double b) {
+    return PetscPrintf(comm, "  %-28s %12.4g %12.4g J\n", name.c_str(), a, b);
+  };
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscPrintf(comm, "\n%-30s %12s %12s\n", "Energy", "breath", "to the peak"));
+  PetscCall(line("ventilator_work", whole.ventilator_work, filling.ventilator_work));
+  for (std::size_t i = 0; i < audit.accounts().size(); ++i)
+    if (whole.accounts[i] != 0 || filling.accounts[i] != 0)
+      PetscCall(line((audit.accounts()[i].kind == Energy::external ? "+ " : "- ") + audit.accounts()[i].name,
+                     whole.accounts[i], filling.accounts[i]));
+  PetscCall(line("= residual", whole.residual, filling.residual));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode print_regions(MPI_Comm comm, const RegionAudit &audit, const BreathRows &breath)
+{
+  PetscFunctionBeginUser;
+  PetscCall(PetscPrintf(comm, "\n%-18s %10s %14s %7s %8s %8s %12s %8s\n", "Region", "rest ml", "ventilation ml",
+                        "share", "J", "+-", "P cmH2O", "+-"));
+  for (std::size_t r = 0; r < audit.regions().size(); ++r) {
+    const RegionState &s = audit.state(breath.fullest, r);
+    PetscCall(PetscPrintf(comm, "  %-16s %10.4g %14.4g %6.1f%% %8.4f %8.4f %12.4g %8.2g\n",
+                          audit.regions()[r].name.c_str(), audit.volume(r), ventilation(audit, breath, r),
+                          100 * ventilation_share(audit, breath, r).value_or(0), s.mean_J, s.sd_J, s.mean_pressure,
+                          s.sd_pressure));
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace
+
+PetscErrorCode print_numbers(MPI_Comm comm, const Output &output, const Scene &scene, const Simulation &simulation,
+                             const Audits &audits)
+{
+  const std::vector<SignalRow> rows = audits.regions.complete(simulation.rows());
+  const BreathRows breath = last_breath(rows);
+
   PetscFunctionBeginUser;
   if (scene.facts().ventilator) {
     PetscCall(PetscPrintf(comm,
                           "\n%s tissue, %.0f ml at rest: clinical numbers of the last breath (fits over all breaths)\n",
                           scene.tissue().law().name(), (double)(scene.mesh().volume() / units::mm3_per_ml)));
-    for (const Entry &e : entries(overall_numbers(simulation.rows()), functional_residual_capacity(scene))) {
+    for (const Entry &e : entries(overall_numbers(rows), functional_residual_capacity(scene))) {
       if (!e.value) continue;
       PetscCall(PetscPrintf(comm, "  %-28s %12.4g %s\n", e.label, *e.value, e.unit));
     }
   }
-  PetscCall(PetscPrintf(comm, "Smallest J %.4f", (double)simulation.min_J()));
+  if (audits.energy) PetscCall(print_energy(comm, *audits.energy, breath));
+  if (audits.regions.regions().size() > 1) PetscCall(print_regions(comm, audits.regions, breath));
+  PetscCall(PetscPrintf(comm, "\nSmallest J %.4f", (double)simulation.min_J()));
   if (scene.facts().airflow)
     PetscCall(PetscPrintf(comm, "; air lost by the numbers: %.2g ml",
                           (double)(simulation.mass_balance_error() / units::mm3_per_ml)));

@@ -77,6 +77,7 @@ public:
       c.residual("-J p F^-T : Grad eta", displacement, nullptr, volume_residual<P, K::gas_stress>);
       c.jacobian("gas stress", displacement, displacement, nullptr, nullptr, nullptr,
                  volume_jacobian<P, K::gas_stress_by_displacement>);
+      c.energy(Energy::numerical, "numerical_dissipation", "", energy_density<P, numerical_gas_loss>);
     }
     PetscFunctionReturn(PETSC_SUCCESS);
   }
