@@ -23,8 +23,9 @@ PIP, PEEP, INSPIRATION, PAUSE, EXPIRATION, RAMP, RAMP_DOWN, BREATHS, DT = 7.0, 2
 BREATHING = ["-ventilator_pip", PIP, "-ventilator_peep", PEEP, "-ventilator_inspiration", INSPIRATION,
              "-ventilator_pause", PAUSE, "-ventilator_expiration", EXPIRATION, "-ventilator_ramp", RAMP,
              "-ventilator_ramp_down", RAMP_DOWN, "-ventilator_breaths", BREATHS, "-ts_dt", DT]
-# numbers of a breath that need the alveolar pressure
-NUMBERS_OF_FIELDS = {"auto_peep_cmH2O", "total_peep_cmH2O", "static_compliance_ml_per_cmH2O"}
+# numbers of a breath that need the fields (audit_test.py)
+NUMBERS_OF_FIELDS = {"auto_peep_cmH2O", "total_peep_cmH2O", "static_compliance_ml_per_cmH2O", "energy_j",
+                     "inspiratory_energy_j"}
 # slow enough to leave some gas behind
 GAS = ["-airflow_permeability", "300"]
 
@@ -120,7 +121,7 @@ class Breaths(unittest.TestCase):
     def test_files(self):
         snapshots = len(schedule()) + 1
         self.assertEqual(self.case.files(), sorted(
-            ["signals.csv", "summary.json", "fields.xdmf", "fields.h5"] + [f"fields_{i:05d}.h5" for i in range(snapshots)]))
+            ["signals.csv", "summary.json", "energy.csv", "fields.xdmf", "fields.h5"] + [f"fields_{i:05d}.h5" for i in range(snapshots)]))
         self.assertEqual(self.case.code, 0)
 
     def test_columns_and_first_row(self):
@@ -198,7 +199,8 @@ class Breaths(unittest.TestCase):
                 else:
                     self.assertAlmostEqual(n[name], value, delta=1e-9 * max(1, abs(value)), msg=name)
         last = self.summary["breaths"][-1]
-        for name in set(last) - {"compliance_ml_per_cmH2O", "resistance_cmH2O_s_per_l", "time_constant_s"}:
+        for name in set(last) - {"compliance_ml_per_cmH2O", "resistance_cmH2O_s_per_l", "time_constant_s",
+                                 "energy_j", "inspiratory_energy_j"}:
             self.assertEqual(self.summary[name], last[name], name)
         self.assertGreater(abs(self.summary["breaths"][0]["trapped_volume_ml"]), 1e-6)
 
@@ -418,7 +420,7 @@ class OtherScenes(unittest.TestCase):
         with open(first.path("notes.txt"), "w") as f:
             f.write("the user's own\n")
         again = pulmo.finished(base + ["-airflow", "off", "-output_overwrite"], directory=first.directory)
-        self.assertEqual(again.files(), sorted(["fields.h5", "fields.xdmf", "fields_00000.h5", "fields_00001.h5",
+        self.assertEqual(again.files(), sorted(["energy.csv", "fields.h5", "fields.xdmf", "fields_00000.h5", "fields_00001.h5",
                                                 "notes.txt", "signals.csv", "summary.json"]))
 
     def test_several_runs_share_no_file(self):
@@ -445,7 +447,7 @@ class Help(unittest.TestCase):
         "-ventilator_breaths": "-", "-lumen_pressure": "on/off", "-lumen_pressure_surfaces": None, "-support": "on/off",
         "-support_rigid": "on/off", "-support_surfaces": None, "-traction": "on/off", "-traction_surfaces": None,
         "-traction_value": "kPa", "-quadrature_degree": "-", "-output_dir": "text", "-output_overwrite": "on/off",
-        "-output_fields_every": "s", "-progress": "on/off", "-effects_view": "on/off"}
+        "-output_fields_every": "s", "-progress": "on/off", "-effects_view": "on/off", "-energy_audit": "on/off"}
 
     def test_every_option_with_its_unit(self):
         case = pulmo.finished(["-help"])
