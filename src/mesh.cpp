@@ -160,13 +160,14 @@ bool own_label(const std::string &name)
 PetscErrorCode labelled_points(DM dm, const char *name, PetscInt begin, PetscInt end, std::vector<PetscInt> &points)
 {
   DMLabel label;
+  PetscInt none;
 
   PetscFunctionBeginUser;
   points.clear();
   PetscCall(DMGetLabel(dm, name, &label));
+  PetscCall(DMLabelGetDefaultValue(label, &none));
   for (PetscInt p = begin; p < end; ++p) {
-    PetscInt value, none;
-    PetscCall(DMLabelGetDefaultValue(label, &none));
+    PetscInt value;
     PetscCall(DMLabelGetValue(label, p, &value));
     if (value != none) points.push_back(p);
   }
