@@ -89,9 +89,12 @@ PetscErrorCode EnergyAudit::integrate(const Part &part, const StepReport &step, 
   const PetscScalar *constants;
   std::vector<Sample> now, before;
   const PetscReal t = step.row.time, dt = step.row.dt;
-  const Step step_now{dt, step.row.pressure * units::kPa_per_cmH2O}, step_before{dt, gas_pressure_};
+  Step step_now{}, step_before{};
 
   PetscFunctionBeginUser;
+  step_now.dt = step_before.dt = dt;
+  step_now.gas_pressure = step.row.pressure * units::kPa_per_cmH2O;
+  step_before.gas_pressure = gas_pressure_;
   PetscCall(DMGetDS(model_.dm(), &ds));
   PetscCall(PetscDSGetConstants(ds, &n_constants, &constants));
   const ReadArray x(step.local), x_before(before_);
