@@ -43,39 +43,21 @@ void barycentric_gradients(const PetscReal inverse[9], PetscReal g[12])
 
 PetscErrorCode Sampling::setup(const Model &model)
 {
-  PetscSection section;
   PetscDS ds;
   PetscFE fe;
   PetscQuadrature rule, face_rule;
   PetscInt begin, end;
-  VecHandle numbers;
   std::vector<PetscReal> xi, eta, weights, face_weights;
 
   PetscFunctionBeginUser;
   dm_ = model.dm();
+  assembly_ = &model.assembly();
   gas_ = model.composition().fields().size() > pressure;
-  PetscCall(DMGetLocalSection(dm_, &section));
   PetscCall(DMGetDS(dm_, &ds));
-  PetscCall(PetscDSGetTotalDimension(ds, &element_size_));
   PetscCall(DMPlexGetHeightStratum(dm_, 0, &begin, &end));
-
-  // where the dofs of a cell are: gather a vector that holds its own indices
-  PetscCall(DMCreateLocalVector(dm_, numbers.out()));
-  {
-    PetscInt n;
-    PetscCall(VecGetLocalSize(numbers, &n));
-    WriteArray values(numbers);
-    for (PetscInt i = 0; i < n; ++i) values[i] = i;
-  }
   for (PetscInt c = begin; c < end; ++c) {
-    PetscScalar *values = nullptr;
-    PetscInt n;
     Element e{};
     PetscReal det;
-    PetscCall(DMPlexVecGetClosure(dm_, section, numbers, c, &n, &values));
-    PetscCheck(n == element_size_, PETSC_COMM_SELF, PETSC_ERR_PLIB, "closure and element differ in size");
-    for (PetscInt i = 0; i < n; ++i) dofs_.push_back(static_cast<PetscInt>(PetscRealPart(values[i])));
-    PetscCall(DMPlexVecRestoreClosure(dm_, section, numbers, c, &n, &values));
     PetscCall(DMPlexComputeCellGeometryAffineFEM(dm_, c, e.v0, e.J, e.inverse, &det));
     e.cell = c - begin;
     e.measure = det * reference_volume;
@@ -180,7 +162,7 @@ PetscErrorCode Sampling::surface(const Mesh &mesh, const std::string &name, std:
 void Sampling::sample(const Element &e, const PetscScalar *x, std::vector<Sample> &samples) const
 {
   const Table &t = tables_[e.table];
-  const PetscInt *dofs = &dofs_[e.cell * element_size_];
+  const PetscInt *dofs = assembly_->cell_dofs(e.cell);
 
   samples.resize(t.weights.size());
   for (std::size_t q = 0; q < samples.size(); ++q) {

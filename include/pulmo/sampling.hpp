@@ -54,10 +54,10 @@ private:
   PetscErrorCode add_table(const std::vector<PetscReal> &xi, const std::vector<PetscReal> &weights);
 
   DM dm_ = nullptr; ///< not owned
+  const Assembly *assembly_ = nullptr;
   bool gas_ = false;
-  PetscInt element_size_ = 0, nodes_ = 0, corners_ = 0;
-  std::vector<PetscInt> dofs_; ///< [cell][element_size]: offset in the local vector
-  std::vector<Table> tables_;  ///< of the cell, then of the faces opposite its corners
+  PetscInt nodes_ = 0, corners_ = 0;
+  std::vector<Table> tables_; ///< of the cell, then of the faces opposite its corners
   std::vector<Element> cells_;
 };
 
