@@ -9,19 +9,80 @@ namespace pulmo {
 
 namespace {
 
-/// First and last row of each breath; a breath starts at the last row before it.
-std::vector<std::pair<std::size_t, std::size_t>> breaths(const std::vector<SignalRow> &rows)
+/// Volumes closer than this share of the tidal volume are the same.
+constexpr double same_volume = 1e-6;
+
+/// Flow below this share of the peak is no flow.
+constexpr double no_flow = 1e-3;
+
+/// a / b where b is positive.
+std::optional<double> ratio(double a, double b)
 {
-  std::vector<std::pair<std::size_t, std::size_t>> list;
+  return b > 0 ? std::optional<double>(a / b) : std::nullopt;
+}
+
+/// The last row before the pause that ends at row @p end, not before row @p first.
+std::size_t before_pause(const std::vector<SignalRow> &rows, std::size_t first, std::size_t end)
+{
+  std::size_t i = end;
+  while (i > first && rows[i].phase == rows[end].phase && rows[i].breath == rows[end].breath && rows[i].pause()) --i;
+  return i;
+}
+
+/// Plateau, resistance from the pause and slope of the static curve.
+void add_pauses(const std::vector<SignalRow> &rows, std::size_t first, std::size_t last, ClinicalNumbers &n)
+{
+  const auto points = static_points(rows, first, last);
+  if (points.empty()) return;
+  std::size_t fullest = 0;
+  for (std::size_t k = 1; k < points.size(); ++k)
+    if (rows[points[k].row].volume >= rows[points[fullest].row].volume - same_volume * n.tidal_volume) fullest = k;
+
+  const SignalRow &end = rows[points[fullest].row], &before = rows[before_pause(rows, first, points[fullest].row)];
+  n.plateau_pressure = end.machine_pressure();
+  if (std::abs(end.volume - before.volume) <= same_volume * n.tidal_volume && before.flow > no_flow * n.peak_flow)
+    n.pause_resistance = (before.machine_pressure() - end.machine_pressure()) / before.flow * 1000;
+
+  // regression of pressure on volume: volumes are given, pressures are the answer (as in eq. 52)
+  double P = 0, V = 0, PV = 0, VV = 0;
+  const auto count = static_cast<double>(fullest + 1);
+  for (std::size_t k = 0; k <= fullest; ++k) {
+    P += rows[points[k].row].machine_pressure() / count;
+    V += rows[points[k].row].volume / count;
+  }
+  for (std::size_t k = 0; k <= fullest; ++k) {
+    const double dV = rows[points[k].row].volume - V;
+    PV += (rows[points[k].row].machine_pressure() - P) * dV;
+    VV += dV * dV;
+  }
+  if (std::sqrt(VV / count) > same_volume * n.tidal_volume) n.static_curve_compliance = ratio(VV, PV);
+}
+
+} // namespace
+
+std::vector<BreathRows> breath_rows(const std::vector<SignalRow> &rows)
+{
+  std::vector<BreathRows> list;
   for (std::size_t i = 1; i < rows.size(); ++i) {
     if (rows[i].breath < 1) continue;
-    if (list.empty() || rows[i].breath != rows[i - 1].breath || rows[i - 1].dt == 0) list.emplace_back(i - 1, i);
-    list.back().second = i;
+    if (list.empty() || rows[i].breath != rows[i - 1].breath || rows[i - 1].dt == 0) list.push_back({i - 1, i, i - 1});
+    BreathRows &b = list.back();
+    b.last = i;
+    if (rows[i].volume > rows[b.fullest].volume) b.fullest = i;
   }
   return list;
 }
 
-} // namespace
+std::vector<StaticPoint> static_points(const std::vector<SignalRow> &rows, std::size_t first, std::size_t last)
+{
+  std::vector<StaticPoint> points;
+  for (std::size_t i = first + 1; i <= last && i < rows.size(); ++i) {
+    if (!rows[i].pause()) continue;
+    if (i < last && rows[i + 1].phase == rows[i].phase && rows[i + 1].breath == rows[i].breath) continue;
+    points.push_back({i, rows[before_pause(rows, first, i)].phase});
+  }
+  return points;
+}
 
 void fit_single_compartment(const std::vector<SignalRow> &rows, std::size_t first, std::size_t last, double peep,
                             ClinicalNumbers &numbers)
@@ -30,7 +91,7 @@ void fit_single_compartment(const std::vector<SignalRow> &rows, std::size_t firs
   double VV = 0, VQ = 0, QQ = 0, PV = 0, PQ = 0; // normal equations
   for (std::size_t i = first + 1; i <= last; ++i) {
     const SignalRow &r = rows[i];
-    const double P = r.pressure - peep, V = r.volume - start, Q = r.flow, w = r.dt;
+    const double P = r.machine_pressure() - peep, V = r.volume - start, Q = r.flow, w = r.dt;
     VV += w * V * V;
     VQ += w * V * Q;
     QQ += w * Q * Q;
@@ -46,46 +107,54 @@ void fit_single_compartment(const std::vector<SignalRow> &rows, std::size_t firs
   numbers.time_constant = R / E;
 }
 
-ClinicalNumbers clinical_numbers(const std::vector<SignalRow> &rows, std::size_t first, std::size_t last, double peep)
+ClinicalNumbers clinical_numbers(const std::vector<SignalRow> &rows, std::size_t first, std::size_t last)
 {
   ClinicalNumbers n;
-  const SignalRow &start = rows[first];
+  const SignalRow &start = rows[first], &end = rows[last];
   double work = 0; // cmH2O ml
 
-  n.peak_pressure = start.pressure;
+  n.peak_pressure = n.peep = start.machine_pressure();
   for (std::size_t i = first + 1; i <= last; ++i) {
     const SignalRow &r = rows[i], &before = rows[i - 1];
-    n.peak_pressure = std::max(n.peak_pressure, r.pressure);
+    n.peak_pressure = std::max(n.peak_pressure, r.machine_pressure());
     n.tidal_volume = std::max(n.tidal_volume, r.volume - start.volume);
     n.peak_flow = std::max(n.peak_flow, r.flow);
-    if (r.phase == "pause") n.plateau_pressure = r.pressure;
-    work += ((r.pressure + before.pressure) / 2 - peep) * (r.volume - before.volume);
+    n.peak_expiratory_flow = std::max(n.peak_expiratory_flow, -r.flow);
+    work += ((r.machine_pressure() + before.machine_pressure()) / 2 - n.peep) * (r.volume - before.volume);
   }
-  n.trapped_volume = rows[last].volume - start.volume;
-  n.driving_pressure = n.plateau_pressure.value_or(n.peak_pressure) - peep;
+  add_pauses(rows, first, last, n);
+  n.trapped_volume = end.volume - start.volume;
+  n.driving_pressure = n.plateau_pressure.value_or(n.peak_pressure) - n.peep;
+  n.dynamic_compliance = ratio(n.tidal_volume, n.peak_pressure - n.peep);
+  if (n.plateau_pressure)
+    n.static_compliance = ratio(n.tidal_volume, *n.plateau_pressure - start.alveolar_pressure.value_or(n.peep));
+  if (end.alveolar_pressure) {
+    n.total_peep = *end.alveolar_pressure;
+    n.auto_peep = *end.alveolar_pressure - n.peep;
+  }
   n.work = work * units::kPa_per_cmH2O * 1e-3; // kPa ml = 1e-3 J
-  const double duration = rows[last].time - start.time;
+  const double duration = end.time - start.time;
   n.mechanical_power = duration > 0 ? n.work * 60 / duration : 0;
-  fit_single_compartment(rows, first, last, peep, n);
+  fit_single_compartment(rows, first, last, n.peep, n);
   return n;
 }
 
-std::vector<ClinicalNumbers> breath_numbers(const std::vector<SignalRow> &rows, double peep)
+std::vector<ClinicalNumbers> breath_numbers(const std::vector<SignalRow> &rows)
 {
   std::vector<ClinicalNumbers> list;
-  for (const auto &[first, last] : breaths(rows)) list.push_back(clinical_numbers(rows, first, last, peep));
+  for (const BreathRows &b : breath_rows(rows)) list.push_back(clinical_numbers(rows, b.first, b.last));
   return list;
 }
 
-ClinicalNumbers overall_numbers(const std::vector<SignalRow> &rows, double peep)
+ClinicalNumbers overall_numbers(const std::vector<SignalRow> &rows)
 {
-  const auto list = breaths(rows);
+  const auto list = breath_rows(rows);
   if (list.empty()) return {};
-  ClinicalNumbers n = clinical_numbers(rows, list.back().first, list.back().second, peep);
+  ClinicalNumbers n = clinical_numbers(rows, list.back().first, list.back().last);
   n.compliance.reset();
   n.resistance.reset();
   n.time_constant.reset();
-  fit_single_compartment(rows, list.front().first, list.back().second, peep, n);
+  fit_single_compartment(rows, list.front().first, list.back().last, rows[list.front().first].machine_pressure(), n);
   return n;
 }
 

@@ -138,6 +138,42 @@ PetscErrorCode find_bodies(DM dm, PetscInt begin, PetscInt end, std::vector<Pets
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+/// The least number of a body above @p last, over all ranks; PETSC_MAX_INT after the last.
+PetscErrorCode next_body(MPI_Comm comm, const std::vector<PetscInt> &body, PetscInt last, PetscInt &next)
+{
+  PetscFunctionBeginUser;
+  next = PETSC_MAX_INT;
+  for (PetscInt number : body)
+    if (number > last) next = std::min(next, number);
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &next, 1, MPIU_INT, MPI_MIN, comm));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Labels that are not physical names of the mesh.
+bool own_label(const std::string &name)
+{
+  const std::string own[] = {"celltype", "depth", "ghost", "marker", "Cell Sets", "Face Sets", "vtk"};
+  return std::find(std::begin(own), std::end(own), name) != std::end(own);
+}
+
+/// Mesh points in [begin, end) that a label marks, in order.
+PetscErrorCode labelled_points(DM dm, const char *name, PetscInt begin, PetscInt end, std::vector<PetscInt> &points)
+{
+  DMLabel label;
+  PetscInt none;
+
+  PetscFunctionBeginUser;
+  points.clear();
+  PetscCall(DMGetLabel(dm, name, &label));
+  PetscCall(DMLabelGetDefaultValue(label, &none));
+  for (PetscInt p = begin; p < end; ++p) {
+    PetscInt value;
+    PetscCall(DMLabelGetValue(label, p, &value));
+    if (value != none) points.push_back(p);
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 } // namespace
 
 PetscErrorCode Mesh::declare(Options &options)
@@ -283,8 +319,7 @@ PetscErrorCode Mesh::find_surfaces(const Options &options)
     PetscReal area = 0;
 
     PetscCall(DMGetLabelName(dm_, l, &name));
-    const std::string own[] = {"celltype", "depth", "ghost", "marker", "Cell Sets", "Face Sets", "vtk"};
-    if (std::find(std::begin(own), std::end(own), name) != std::end(own)) continue;
+    if (own_label(name)) continue;
     PetscCall(DMGetLabel(dm_, name, &label));
     PetscCall(DMLabelGetValueIS(label, values_is.out()));
     PetscCall(ISGetLocalSize(values_is, &n_values));
@@ -379,6 +414,91 @@ PetscErrorCode Mesh::node_coordinates(PetscInt point, PetscReal x[3]) const
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode Mesh::regions(std::vector<Region> &list) const
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
+  PetscInt vertex_begin, vertex_end, begin, end, n_labels, last = -1;
+  std::vector<PetscInt> body_of, cell_body;
+  struct Body {
+    Region region;
+    PetscReal centroid[3];
+  };
+  std::vector<Body> bodies;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMPlexGetDepthStratum(dm_, 0, &vertex_begin, &vertex_end));
+  PetscCall(DMPlexGetHeightStratum(dm_, 0, &begin, &end));
+  PetscCall(find_bodies(dm_, vertex_begin, vertex_end, body_of));
+  for (PetscInt c = begin; c < end; ++c) {
+    PetscInt *closure = nullptr, n;
+    PetscCall(DMPlexGetTransitiveClosure(dm_, c, PETSC_TRUE, &n, &closure));
+    for (PetscInt i = 0; i < n; ++i)
+      if (closure[2 * i] >= vertex_begin && closure[2 * i] < vertex_end) {
+        cell_body.push_back(body_of[closure[2 * i] - vertex_begin]);
+        break;
+      }
+    PetscCall(DMPlexRestoreTransitiveClosure(dm_, c, PETSC_TRUE, &n, &closure));
+  }
+  for (;;) {
+    PetscInt next;
+    PetscReal moments[4] = {0, 0, 0, 0};
+    Body body;
+    PetscCall(next_body(comm, body_of, last, next));
+    if (next == PETSC_MAX_INT) break;
+    for (PetscInt c = 0; c < end - begin; ++c) {
+      PetscReal volume, centre[3];
+      if (cell_body[c] != next) continue;
+      body.region.cells.push_back(c);
+      PetscCall(DMPlexComputeCellGeometryFVM(dm_, begin + c, &volume, centre, nullptr));
+      moments[3] += volume;
+      for (int d = 0; d < 3; ++d) moments[d] += volume * centre[d];
+    }
+    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, moments, 4, MPIU_REAL, MPI_SUM, comm));
+    for (int d = 0; d < 3; ++d) body.centroid[d] = moments[d] / moments[3];
+    body.region.body = true;
+    bodies.push_back(body);
+    last = next;
+  }
+  // the numbers of the bodies depend on how the mesh is distributed, their places do not
+  const PetscReal rounding = 1e-6 * length_;
+  std::sort(bodies.begin(), bodies.end(), [rounding](const Body &a, const Body &b) {
+    for (int d = 0; d < 3; ++d)
+      if (std::abs(a.centroid[d] - b.centroid[d]) > rounding) return a.centroid[d] < b.centroid[d];
+    return false;
+  });
+
+  list.clear();
+  PetscCall(DMGetNumLabels(dm_, &n_labels));
+  for (PetscInt l = 0; l < n_labels; ++l) {
+    const char *name;
+    Region region;
+    PetscCall(DMGetLabelName(dm_, l, &name));
+    if (own_label(name)) continue;
+    PetscCall(labelled_points(dm_, name, begin, end, region.cells));
+    auto found = static_cast<PetscInt>(region.cells.size());
+    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &found, 1, MPIU_INT, MPI_SUM, comm));
+    if (found == 0) continue;
+    region.name = name;
+    for (PetscInt &c : region.cells) c -= begin;
+    for (Body &body : bodies) {
+      int same = body.region.cells == region.cells;
+      PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &same, 1, MPI_INT, MPI_LAND, comm));
+      if (!same || !body.region.name.empty()) continue;
+      region.body = true;
+      body.region.name = name;
+    }
+    list.push_back(region);
+  }
+  std::sort(list.begin(), list.end(), [](const Region &a, const Region &b) { return a.name < b.name; });
+  int unnamed = 0;
+  for (Body &body : bodies) {
+    if (!body.region.name.empty()) continue;
+    body.region.name = "body_" + std::to_string(++unnamed);
+    list.push_back(body.region);
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode Mesh::rigid_pins(std::vector<Pin> &pins) const
 {
   const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
@@ -390,11 +510,9 @@ PetscErrorCode Mesh::rigid_pins(std::vector<Pin> &pins) const
   PetscCall(find_bodies(dm_, begin, end, body));
   pins.clear();
   for (;;) { // bodies in the order of their numbers
-    PetscInt next = PETSC_MAX_INT;
+    PetscInt next;
     std::vector<PetscInt> vertices;
-    for (PetscInt number : body)
-      if (number > last) next = std::min(next, number);
-    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &next, 1, MPIU_INT, MPI_MIN, comm));
+    PetscCall(next_body(comm, body, last, next));
     if (next == PETSC_MAX_INT) break;
     for (PetscInt v = begin; v < end; ++v)
       if (body[v - begin] == next) vertices.push_back(v);

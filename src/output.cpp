@@ -67,7 +67,7 @@ PetscErrorCode Output::prepare(const Options &options)
   if (rank == 0) { // what an earlier run left must not pass for this one's
     std::error_code error;
     for (const char *old :
-         {"summary.json", "failure.json", "signals.csv", "signals.csv.part", "fields.xdmf", "fields.h5"})
+         {"summary.json", "failure.json", "signals.csv", "signals.csv.part", "energy.csv", "fields.xdmf", "fields.h5"})
       fs::remove(path(old), error);
     for (const auto &entry : fs::directory_iterator(directory_, error)) {
       const std::string name = entry.path().filename().string();
@@ -107,7 +107,7 @@ PetscErrorCode SignalWriter::observe(const StepReport &step)
       std::fprintf(file_, "%.15g,", r.volume);
       if (ventilator) std::fprintf(file_, "%s,", r.phase.c_str());
       std::fprintf(file_, "%.15g,%ld,%ld,%.15g,%.15g", r.dt, r.newton, r.krylov, r.min_J, r.max_J);
-      if (facts_.tube) std::fprintf(file_, ",%.15g", r.ventilator_pressure);
+      if (facts_.tube) std::fprintf(file_, ",%.15g", r.machine_pressure());
       std::fprintf(file_, "\n");
     }
     written = file_ && std::fflush(file_) == 0 && !std::ferror(file_);

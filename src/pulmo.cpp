@@ -105,7 +105,7 @@ PetscErrorCode run(const Registry &registry, bool &finished)
   const Scene &scene = run.scene();
   Simulation &simulation = run.simulation();
   Output output;
-  bool view_effects = false;
+  bool view_effects = false, audit_energy = true;
   PetscBool help, has_mesh;
 
   PetscFunctionBeginUser;
@@ -114,6 +114,8 @@ PetscErrorCode run(const Registry &registry, bool &finished)
   PetscCall(output.declare(options));
   options.group("effects", "ledger");
   PetscCall(options.flag("view", "print effects, fields, terms, blocks and seconds at the end", view_effects));
+  options.group("energy", "energy balance");
+  PetscCall(options.flag("audit", "follow the energy balance over the steps (energy.csv)", audit_energy));
   PetscCall(PetscOptionsHasHelp(nullptr, &help));
   PetscCall(PetscOptionsHasName(nullptr, nullptr, "-dm_plex_filename", &has_mesh));
   if (help) PetscCall(options.print_help());
@@ -131,21 +133,33 @@ PetscErrorCode run(const Registry &registry, bool &finished)
   SignalWriter signals(comm, output, scene.facts());
   ProgressPrinter progress(comm, scene.facts());
   FieldWriter fields(output, scene, run.model());
+  Sampling sampling;
+  RegionAudit regions(scene, run.model(), sampling);
+  EnergyAudit energy(scene, run.model(), sampling);
+  const Audits audits{regions, audit_energy ? &energy : nullptr};
+  PetscCall(sampling.setup(run.model()));
+  PetscCall(regions.setup());
+  simulation.add(regions);
+  if (audit_energy) {
+    PetscCall(energy.setup());
+    simulation.add(energy);
+  }
   simulation.add(signals);
   simulation.add(fields);
   if (output.progress()) simulation.add(progress);
   PetscCall(simulation.run(finished));
   PetscCall(options.warn_unused());
   if (view_effects) PetscCall(print_ledger(comm, scene, run.model(), simulation.seconds()));
+  if (audit_energy) PetscCall(write_energy(comm, output, simulation, energy));
   if (!finished) {
     PetscCall(fields.snapshot(simulation.time(), simulation.local_state()));
-    PetscCall(write_summary(options, output, scene, run.model(), simulation, false));
+    PetscCall(write_summary(options, output, scene, run.model(), simulation, audits, false));
     PulmoUserError(comm, "%s The last good state and the signals so far are in %s.", simulation.failure_text().c_str(),
                    output.directory().c_str());
   }
   PetscCall(signals.finish());
-  PetscCall(write_summary(options, output, scene, run.model(), simulation, true));
-  PetscCall(print_numbers(comm, output, scene, simulation));
+  PetscCall(write_summary(options, output, scene, run.model(), simulation, audits, true));
+  PetscCall(print_numbers(comm, output, scene, simulation, audits));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

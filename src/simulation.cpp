@@ -552,6 +552,7 @@ PetscErrorCode Simulation::after_step()
   row.pressure = pressure / units::kPa_per_cmH2O;
   row.ventilator_pressure = airway_.ventilator_pressure(row.flow * units::mm3_per_ml) / units::kPa_per_cmH2O;
   row.phase = phase_->name;
+  row.hold = phase_->control == Control::flow && phase_->to == 0 && phase_->ramp == 0;
   row.breath = static_cast<int>(phase_->breath);
   row.newton = newton_;
   row.krylov = krylov_;

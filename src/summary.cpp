@@ -17,31 +17,144 @@ Json optional_json(const std::optional<double> &v)
   return v ? Json(*v) : Json(nullptr);
 }
 
-void add_numbers(Json &json, const ClinicalNumbers &n)
+/// One number of a breath: its key in summary.json, how it is printed, and its value.
+struct Entry {
+  const char *key, *label, *unit;
+  std::optional<double> value;
+};
+
+/// All numbers of a breath in the order of the table. @p frc: gas volume at rest, ml.
+std::vector<Entry> entries(const ClinicalNumbers &n, const std::optional<double> &frc)
 {
-  json["compliance_ml_per_cmH2O"] = optional_json(n.compliance);
-  json["resistance_cmH2O_s_per_l"] = optional_json(n.resistance);
-  json["time_constant_s"] = optional_json(n.time_constant);
-  json["peak_inspiratory_pressure_cmH2O"] = n.peak_pressure;
-  json["plateau_pressure_cmH2O"] = optional_json(n.plateau_pressure);
-  json["driving_pressure_cmH2O"] = n.driving_pressure;
-  json["tidal_volume_ml"] = n.tidal_volume;
-  json["trapped_volume_ml"] = n.trapped_volume;
-  json["peak_flow_ml_per_s"] = n.peak_flow;
-  json["work_j"] = n.work;
-  json["mechanical_power_j_per_min"] = n.mechanical_power;
+  const auto strain = frc ? std::optional<double>(n.tidal_volume / *frc) : std::nullopt;
+  return {
+      {"peak_inspiratory_pressure_cmH2O", "peak inspiratory pressure", "cmH2O", n.peak_pressure},
+      {"plateau_pressure_cmH2O", "plateau pressure", "cmH2O", n.plateau_pressure},
+      {"peep_cmH2O", "PEEP", "cmH2O", n.peep},
+      {"auto_peep_cmH2O", "auto-PEEP", "cmH2O", n.auto_peep},
+      {"total_peep_cmH2O", "total PEEP", "cmH2O", n.total_peep},
+      {"driving_pressure_cmH2O", "driving pressure", "cmH2O", n.driving_pressure},
+      {"tidal_volume_ml", "tidal volume", "ml", n.tidal_volume},
+      {"trapped_volume_ml", "trapped volume", "ml", n.trapped_volume},
+      {"peak_flow_ml_per_s", "peak inspiratory flow", "ml/s", n.peak_flow},
+      {"peak_expiratory_flow_ml_per_s", "peak expiratory flow", "ml/s", n.peak_expiratory_flow},
+      {"compliance_ml_per_cmH2O", "compliance C_rs (fit)", "ml/cmH2O", n.compliance},
+      {"resistance_cmH2O_s_per_l", "resistance R (fit)", "cmH2O s/l", n.resistance},
+      {"time_constant_s", "time constant R C_rs", "s", n.time_constant},
+      {"static_compliance_ml_per_cmH2O", "static compliance", "ml/cmH2O", n.static_compliance},
+      {"dynamic_compliance_ml_per_cmH2O", "dynamic compliance", "ml/cmH2O", n.dynamic_compliance},
+      {"static_curve_compliance_ml_per_cmH2O", "slope of the static curve", "ml/cmH2O", n.static_curve_compliance},
+      {"pause_resistance_cmH2O_s_per_l", "resistance from the pause", "cmH2O s/l", n.pause_resistance},
+      {"work_j", "work of (P - PEEP)", "J", n.work},
+      {"mechanical_power_j_per_min", "mechanical power", "J/min", n.mechanical_power},
+      {"strain", "strain V_T/FRC", "", strain},
+  };
+}
+
+void add_numbers(Json &json, const ClinicalNumbers &n, const std::optional<double> &frc)
+{
+  for (const Entry &e : entries(n, frc)) json[e.key] = optional_json(e.value);
+}
+
+/// Gas volume at rest, ml: Phi0 V0 (empty without airflow, where no porosity is given).
+std::optional<double> functional_residual_capacity(const Scene &scene)
+{
+  if (!scene.facts().airflow) return std::nullopt;
+  return scene.airflow().porosity() * scene.mesh().volume() / units::mm3_per_ml;
+}
+
+/// The end of every pause of the run.
+Json static_curve(const std::vector<SignalRow> &rows)
+{
+  Json curve = Json::array();
+  for (const StaticPoint &point : static_points(rows, 0, rows.size() - 1)) {
+    const SignalRow &r = rows[point.row];
+    curve.push_back({{"time_s", r.time},
+                     {"phase", point.phase},
+                     {"volume_ml", r.volume},
+                     {"pressure_cmH2O", r.machine_pressure()}});
+  }
+  return curve;
+}
+
+/// Rows of the balance with their signs as listed.
+Json energy_json(const EnergyAudit &audit, const EnergyBalance &balance)
+{
+  Json json;
+  json["ventilator_work"] = balance.ventilator_work;
+  for (std::size_t i = 0; i < balance.accounts.size(); ++i) json[audit.accounts()[i].name] = balance.accounts[i];
+  json["residual"] = balance.residual;
+  json["residual_relative"] = balance.relative_residual();
+  return json;
+}
+
+/// The rows that regions are compared at: those of the last breath, or of the whole run without one.
+BreathRows last_breath(const std::vector<SignalRow> &rows)
+{
+  const auto breaths = breath_rows(rows);
+  return breaths.empty() ? BreathRows{0, rows.size() - 1, rows.size() - 1} : breaths.back();
+}
+
+/// What a region took in during a breath, ml.
+double ventilation(const RegionAudit &audit, const BreathRows &breath, std::size_t region)
+{
+  return audit.state(breath.fullest, region).volume_change - audit.state(breath.first, region).volume_change;
+}
+
+/// The same as a share of the whole lung's.
+std::optional<double> ventilation_share(const RegionAudit &audit, const BreathRows &breath, std::size_t region)
+{
+  const double whole = ventilation(audit, breath, audit.regions().size());
+  return whole != 0 ? std::optional<double>(ventilation(audit, breath, region) / whole) : std::nullopt;
+}
+
+Json regions_json(const RegionAudit &audit, const BreathRows &breath, bool gas)
+{
+  Json json = Json::object();
+  for (std::size_t r = 0; r < audit.regions().size(); ++r) {
+    const RegionState &s = audit.state(breath.fullest, r);
+    const auto pressure_json = [gas](double p) { return gas ? Json(p) : Json(nullptr); };
+    json[audit.regions()[r].name] = {{"connected_body", audit.regions()[r].body},
+                                     {"reference_volume_ml", audit.volume(r)},
+                                     {"ventilation_ml", ventilation(audit, breath, r)},
+                                     {"ventilation_share", optional_json(ventilation_share(audit, breath, r))},
+                                     {"jacobian_mean", s.mean_J},
+                                     {"jacobian_sd", s.sd_J},
+                                     {"alveolar_pressure_mean_cmH2O", pressure_json(s.mean_pressure)},
+                                     {"alveolar_pressure_sd_cmH2O", pressure_json(s.sd_pressure)}};
+  }
+  return json;
+}
+
+/// Gives a file that was written under a temporary name its own; an error on all ranks if that or the writing failed.
+PetscErrorCode finish_file(MPI_Comm comm, std::ofstream &f, const std::string &file)
+{
+  PetscMPIInt rank;
+  int written = 1;
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  if (rank == 0) {
+    std::error_code error;
+    f.close();
+    if (f.good()) std::filesystem::rename(file + ".part", file, error);
+    written = f.good() && !error;
+  }
+  PetscCallMPI(MPI_Bcast(&written, 1, MPI_INT, 0, comm));
+  PulmoUserCheck(written, comm, "cannot write %s; free the disk or choose another -output_dir", file.c_str());
+  PetscFunctionReturn(PETSC_SUCCESS);
 }
 
 } // namespace
 
 PetscErrorCode write_summary(const Options &options, const Output &output, const Scene &scene, const Model &model,
-                             const Simulation &simulation, bool finished)
+                             const Simulation &simulation, const Audits &audits, bool finished)
 {
   const MPI_Comm comm = options.comm();
   PetscMPIInt rank, size;
   PetscInt dofs;
   std::vector<std::pair<std::string, std::string>> used;
-  int written = 1;
+  std::ofstream f;
 
   PetscFunctionBeginUser;
   PetscCallMPI(MPI_Comm_rank(comm, &rank));
@@ -53,14 +166,27 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
     Json json;
     json["finished"] = finished;
     if (!finished) json["failure"] = simulation.failure_text();
+    const auto frc = functional_residual_capacity(scene);
+    const std::vector<SignalRow> rows = audits.regions.complete(simulation.rows());
     if (scene.facts().ventilator) {
-      add_numbers(json, overall_numbers(simulation.rows(), scene.ventilator().peep()));
+      add_numbers(json, overall_numbers(rows), frc);
+      json["static_curve"] = static_curve(rows);
       json["breaths"] = Json::array();
-      for (const ClinicalNumbers &n : breath_numbers(simulation.rows(), scene.ventilator().peep())) {
-        json["breaths"].emplace_back();
-        add_numbers(json["breaths"].back(), n);
+      for (const BreathRows &b : breath_rows(rows)) {
+        Json breath;
+        add_numbers(breath, clinical_numbers(rows, b.first, b.last), frc);
+        if (audits.energy) {
+          const auto &energy = audits.energy->rows();
+          breath["energy_j"] = energy_json(*audits.energy, energy[b.last] - energy[b.first]);
+          breath["inspiratory_energy_j"] = energy_json(*audits.energy, energy[b.fullest] - energy[b.first]);
+        }
+        json["breaths"].push_back(breath);
       }
     }
+    if (audits.energy) json["energy_j"] = energy_json(*audits.energy, audits.energy->rows().back());
+    const bool gas = scene.facts().airflow || scene.facts().ventilator;
+    json["regions"] = regions_json(audits.regions, last_breath(rows), gas);
+    json["functional_residual_capacity_ml"] = optional_json(frc);
     json["reference_volume_ml"] = scene.mesh().volume() / units::mm3_per_ml;
     PetscReal total = 0;
     Json areas;
@@ -98,41 +224,96 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
     for (const auto &[name, value] : used) list[name] = value;
     json["options"] = list;
 
-    const std::string part = file + ".part";
-    std::ofstream f(part);
+    f.open(file + ".part");
     f << json.dump(2, ' ', false, Json::error_handler_t::replace) << "\n";
-    f.close();
-    std::error_code error;
-    if (f.good()) std::filesystem::rename(part, file, error);
-    written = f.good() && !error;
   }
-  PetscCallMPI(MPI_Bcast(&written, 1, MPI_INT, 0, comm));
-  PulmoUserCheck(written, comm, "cannot write %s; free the disk or choose another -output_dir", file.c_str());
+  PetscCall(finish_file(comm, f, file));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode print_numbers(MPI_Comm comm, const Output &output, const Scene &scene, const Simulation &simulation)
+PetscErrorCode write_energy(MPI_Comm comm, const Output &output, const Simulation &simulation, const EnergyAudit &audit)
+{
+  const std::string file = output.path("energy.csv");
+  PetscMPIInt rank;
+  std::ofstream f;
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  if (rank == 0) {
+    f.open(file + ".part");
+    f.precision(15);
+    f << "time_s,ventilator_work_j";
+    for (const EnergyAccount &a : audit.accounts()) f << "," << a.name << "_j";
+    f << ",residual_j\n";
+    for (std::size_t i = 0; i < audit.rows().size(); ++i) {
+      const EnergyBalance &b = audit.rows()[i];
+      f << simulation.rows()[i].time << "," << b.ventilator_work;
+      for (double a : b.accounts) f << "," << a;
+      f << "," << b.residual << "\n";
+    }
+  }
+  PetscCall(finish_file(comm, f, file));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+namespace {
+
+/// The balance of the last breath, beside that of its filling.
+PetscErrorCode print_energy(MPI_Comm comm, const EnergyAudit &audit, const BreathRows &breath)
+{
+  const EnergyBalance whole = audit.rows()[breath.last] - audit.rows()[breath.first],
+                      filling = audit.rows()[breath.fullest] - audit.rows()[breath.first];
+  const auto line = [comm](const std::string &name, double a, double b) {
+    return PetscPrintf(comm, "  %-28s %12.4g %12.4g J\n", name.c_str(), a, b);
+  };
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscPrintf(comm, "\n%-30s %12s %12s\n", "Energy", "breath", "to the peak"));
+  PetscCall(line("ventilator_work", whole.ventilator_work, filling.ventilator_work));
+  for (std::size_t i = 0; i < audit.accounts().size(); ++i)
+    if (whole.accounts[i] != 0 || filling.accounts[i] != 0)
+      PetscCall(line((audit.accounts()[i].kind == Energy::external ? "+ " : "- ") + audit.accounts()[i].name,
+                     whole.accounts[i], filling.accounts[i]));
+  PetscCall(line("= residual", whole.residual, filling.residual));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode print_regions(MPI_Comm comm, const RegionAudit &audit, const BreathRows &breath)
 {
   PetscFunctionBeginUser;
-  if (scene.facts().ventilator) {
-    const ClinicalNumbers n = overall_numbers(simulation.rows(), scene.ventilator().peep());
-    PetscCall(
-        PetscPrintf(comm,
-                    "\nThe lung (%.0f ml at rest, %s tissue) took %.1f ml per breath at a peak airway pressure of "
-                    "%.2f cmH2O; %.1f ml stayed behind.\n",
-                    (double)(scene.mesh().volume() / units::mm3_per_ml), scene.tissue().law().name(), n.tidal_volume,
-                    n.peak_pressure, n.trapped_volume));
-    if (n.compliance)
-      PetscCall(PetscPrintf(comm,
-                            "Respiratory-system compliance %.2f ml/cmH2O, resistance %.3f cmH2O s/l, time constant "
-                            "%.3f s (single-compartment fit).\n",
-                            *n.compliance, *n.resistance, *n.time_constant));
-    PetscCall(PetscPrintf(comm,
-                          "Driving pressure %.2f cmH2O, peak flow %.0f ml/s, work %.4f J per breath, mechanical power "
-                          "%.3f J/min.\n",
-                          n.driving_pressure, n.peak_flow, n.work, n.mechanical_power));
+  PetscCall(PetscPrintf(comm, "\n%-18s %10s %14s %7s %8s %8s %12s %8s\n", "Region", "rest ml", "ventilation ml",
+                        "share", "J", "+-", "P cmH2O", "+-"));
+  for (std::size_t r = 0; r < audit.regions().size(); ++r) {
+    const RegionState &s = audit.state(breath.fullest, r);
+    PetscCall(PetscPrintf(comm, "  %-16s %10.4g %14.4g %6.1f%% %8.4f %8.4f %12.4g %8.2g\n",
+                          audit.regions()[r].name.c_str(), audit.volume(r), ventilation(audit, breath, r),
+                          100 * ventilation_share(audit, breath, r).value_or(0), s.mean_J, s.sd_J, s.mean_pressure,
+                          s.sd_pressure));
   }
-  PetscCall(PetscPrintf(comm, "Smallest J %.4f", (double)simulation.min_J()));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace
+
+PetscErrorCode print_numbers(MPI_Comm comm, const Output &output, const Scene &scene, const Simulation &simulation,
+                             const Audits &audits)
+{
+  const std::vector<SignalRow> rows = audits.regions.complete(simulation.rows());
+  const BreathRows breath = last_breath(rows);
+
+  PetscFunctionBeginUser;
+  if (scene.facts().ventilator) {
+    PetscCall(PetscPrintf(comm,
+                          "\n%s tissue, %.0f ml at rest: clinical numbers of the last breath (fits over all breaths)\n",
+                          scene.tissue().law().name(), (double)(scene.mesh().volume() / units::mm3_per_ml)));
+    for (const Entry &e : entries(overall_numbers(rows), functional_residual_capacity(scene))) {
+      if (!e.value) continue;
+      PetscCall(PetscPrintf(comm, "  %-28s %12.4g %s\n", e.label, *e.value, e.unit));
+    }
+  }
+  if (audits.energy) PetscCall(print_energy(comm, *audits.energy, breath));
+  if (audits.regions.regions().size() > 1) PetscCall(print_regions(comm, audits.regions, breath));
+  PetscCall(PetscPrintf(comm, "\nSmallest J %.4f", (double)simulation.min_J()));
   if (scene.facts().airflow)
     PetscCall(PetscPrintf(comm, "; air lost by the numbers: %.2g ml",
                           (double)(simulation.mass_balance_error() / units::mm3_per_ml)));

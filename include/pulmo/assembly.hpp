@@ -54,10 +54,11 @@ public:
   /// Weights of the quadrature points, summing to 1.
   const std::vector<PetscReal> &relative_weights() const { return relative_weights_; }
   PetscInt cells() const { return cells_; }
+  /// Offsets in the local vector of the dofs of cell @p c, field by field in the order of the basis.
+  const PetscInt *cell_dofs(PetscInt c) const { return &cell_dofs_[c * element_size_]; }
   const IntegrationLog &log() const { return log_; }
 
 private:
-  const PetscInt *cell_dofs(PetscInt c) const { return &cell_dofs_[c * element_size_]; }
   struct Facets;
   struct MatrixMap;
 

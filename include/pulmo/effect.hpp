@@ -54,6 +54,27 @@ struct Constraint {
   std::function<void(PetscReal t, const PetscReal x[3], PetscScalar value[3])> value;
 };
 
+/// Where energy goes in the balance  work of the ventilator + external = stored + dissipated + numerical.
+enum class Energy { external, stored, dissipated, numerical };
+
+/// A share of the energy balance: what happens to energy in a step, point by point (pulmo/energy.hpp).
+struct EnergyTerm {
+  std::string effect;
+  Energy kind;
+  std::string account; ///< the row that it adds to, as in summary.json
+  std::string surface; ///< empty: the whole volume
+  EnergyDensity density;
+};
+
+/// What backward Euler loses between the gas and the tissue: p (dJ - cof F : dF), kPa. The ventilator pays for the
+/// whole change of volume, the tissue gets the work of its gas stress, which is linear in the step.
+static inline PetscScalar numerical_gas_loss(const Point &now, const Point &before, const NoParameters &)
+{
+  PetscScalar D[9];
+  for (int i = 0; i < 9; ++i) D[i] = now.state.H[i] - before.state.H[i];
+  return now.gas_pressure() * volume_beyond_linear(now.state.F, D);
+}
+
 /// A block of kernel parameters that lives in an effect and is copied into PetscDS before each evaluation.
 struct ParameterBlock {
   const char *owner;
@@ -121,6 +142,13 @@ public:
     t.bd_g3 = g3;
     terms_.push_back(t);
   }
+  /// A term of the energy balance: work done on the lung in a step (external), growth of a stored energy, energy
+  /// turned to heat (dissipated), and what backward Euler loses beside these: work of the term's force at the end of
+  /// the step along the step, less what is stored (numerical).
+  void energy(Energy kind, const std::string &account, const std::string &surface, EnergyDensity density)
+  {
+    energies_.push_back({effect_, kind, account, surface, density});
+  }
   void constrain(Constraint c)
   {
     c.effect = effect_;
@@ -144,6 +172,7 @@ public:
   const std::vector<FieldSpec> &fields() const { return fields_; }
   const std::vector<Term> &terms() const { return terms_; }
   const std::vector<Constraint> &constraints() const { return constraints_; }
+  const std::vector<EnergyTerm> &energies() const { return energies_; }
   const std::vector<ParameterBlock> &parameter_blocks() const { return parameters_; }
 
 private:
@@ -164,6 +193,7 @@ private:
   std::vector<FieldSpec> fields_;
   std::vector<Term> terms_;
   std::vector<Constraint> constraints_;
+  std::vector<EnergyTerm> energies_;
   std::vector<ParameterBlock> parameters_;
 };
 

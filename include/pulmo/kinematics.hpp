@@ -60,6 +60,14 @@ static inline PetscScalar jacobian_minus_one(const PetscScalar H[9])
   return (H[0] + H[4] + H[8]) + tr_cof + determinant(H);
 }
 
+/// What the linear change of volume misses over a step D that ends at F: J - J_before - cof F : D = det D - F : cof D.
+static inline PetscScalar volume_beyond_linear(const PetscScalar F[9], const PetscScalar D[9])
+{
+  PetscScalar cof_D[9];
+  cofactor(D, cof_D);
+  return determinant(D) - contract(F, cof_D);
+}
+
 /// Adds factor * d(cof F)/dF, stored [i][k][J][L] (PETSc's order of g3 for a vector field):
 /// d(cof F)_iJ / dF_kL = eps_ikm eps_JLN F_mN.
 static inline void add_cofactor_derivative(const PetscScalar F[9], PetscScalar factor, PetscScalar g3[81])

@@ -17,6 +17,12 @@ public:
     PetscInt value = 0;      ///< stratum of the label
     PetscReal area = 0;      ///< mm^2, reference configuration, all ranks
   };
+  /// A part of the volume: a connected body, or what carries a physical name.
+  struct Region {
+    std::string name;
+    bool body = false;           ///< one connected body and no more
+    std::vector<PetscInt> cells; ///< those of this rank, counted from 0
+  };
   /// A vertex held against rigid motion (Mesh::rigid_pins).
   struct Pin {
     PetscInt vertex = -1; ///< local mesh point, -1 on ranks without it
@@ -41,6 +47,9 @@ public:
   PetscErrorCode require_surfaces(const std::vector<std::string> &names, const std::string &option) const;
   /// Three vertices of each connected body and 3, 2, 1 components that remove exactly its six rigid-body modes.
   PetscErrorCode rigid_pins(std::vector<Pin> &pins) const;
+  /// Every connected body and every named part of the volume. A body without a name of its own is called body_1, ...,
+  /// counted along x.
+  PetscErrorCode regions(std::vector<Region> &list) const;
   /// Coordinates of a vertex or of the middle of an edge, mm.
   PetscErrorCode node_coordinates(PetscInt point, PetscReal x[3]) const;
 

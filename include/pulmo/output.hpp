@@ -2,7 +2,8 @@
 /// What a run leaves in its directory: signals.csv, summary.json, fields.xdmf with fields.h5, progress lines.
 #pragma once
 
-#include "pulmo/simulation.hpp"
+#include "pulmo/energy.hpp"
+#include "pulmo/regions.hpp"
 
 #include <cstdio>
 #include <memory>
@@ -79,12 +80,23 @@ private:
   PetscReal next_ = 0;
 };
 
+/// What a run was watched by.
+struct Audits {
+  const RegionAudit &regions;
+  const EnergyAudit *energy; ///< null with -energy_audit off
+};
+
 /// Writes summary.json (a finished run) or failure.json (a run that could not go on).
 PetscErrorCode write_summary(const Options &options, const Output &output, const Scene &scene, const Model &model,
-                             const Simulation &simulation, bool finished);
+                             const Simulation &simulation, const Audits &audits, bool finished);
 
-/// Prints the clinical numbers in words.
-PetscErrorCode print_numbers(MPI_Comm comm, const Output &output, const Scene &scene, const Simulation &simulation);
+/// Writes energy.csv: the balance since the start of the run, a row per step.
+PetscErrorCode write_energy(MPI_Comm comm, const Output &output, const Simulation &simulation,
+                            const EnergyAudit &audit);
+
+/// Prints the clinical numbers, the energy balance and the regions as tables.
+PetscErrorCode print_numbers(MPI_Comm comm, const Output &output, const Scene &scene, const Simulation &simulation,
+                             const Audits &audits);
 
 /// Prints the ledger of `-effects_view`: effect, fields, terms, blocks, seconds.
 PetscErrorCode print_ledger(MPI_Comm comm, const Scene &scene, const Model &model, const StageSeconds &seconds);

@@ -49,6 +49,7 @@ public:
   virtual PetscPointFunc flux_callback() const = 0;
   virtual PetscPointJac flux_by_displacement_callback() const = 0;
   virtual PetscPointJac flux_by_pressure_callback() const = 0;
+  virtual EnergyDensity dissipation_callback() const = 0;
 };
 
 template <class Law>
@@ -73,6 +74,7 @@ public:
   {
     return volume_jacobian<Parameters, Kernels::flux_by_pressure>;
   }
+  EnergyDensity dissipation_callback() const override { return energy_density<Parameters, Kernels::dissipation>; }
 
 private:
   Parameters parameters_;

@@ -161,4 +161,19 @@ void surface_jacobian(PULMO_POINT_ARGUMENTS, PetscReal shift, const PetscReal x[
 
 #undef PULMO_POINT_ARGUMENTS
 
+/// A share of the energy balance of a step, from the state at its end and the one at its start: kPa per reference
+/// volume, kPa mm per reference area.
+template <class P>
+using EnergyKernel = PetscScalar (*)(const Point &now, const Point &before, const P &);
+
+/// The same as the energy audit calls it.
+using EnergyDensity = PetscScalar (*)(const Point &now, const Point &before, const PetscScalar constants[]);
+
+/// Callback of an energy kernel.
+template <class P, EnergyKernel<P> K>
+PetscScalar energy_density(const Point &now, const Point &before, const PetscScalar c[])
+{
+  return K(now, before, constants::get<P>(c));
+}
+
 } // namespace pulmo

@@ -95,6 +95,28 @@ struct TissueKernels {
     }
   }
 
+  /// Strain energy density W, kPa.
+  static PetscScalar energy(const PointState &s, const Parameters &k)
+  {
+    PetscScalar C[9];
+    return Law::energy(invariants(s, Law::uses_I2, C), k).W;
+  }
+
+  /// Growth of W over a step, kPa.
+  static PetscScalar stored(const Point &now, const Point &before, const Parameters &k)
+  {
+    return energy(now.state, k) - energy(before.state, k);
+  }
+
+  /// What backward Euler loses in the tissue: P' : dF - dW with the stress at the end of the step, kPa.
+  static PetscScalar numerical(const Point &now, const Point &before, const Parameters &k)
+  {
+    PetscScalar P[9] = {0}, D[9];
+    stress(now, k, P);
+    for (int i = 0; i < 9; ++i) D[i] = now.state.H[i] - before.state.H[i];
+    return contract(P, D) - stored(now, before, k);
+  }
+
   /// Adds the tangent dP'/dF (kPa), stored [i][k][J][L], to g3.
   static void tangent(const Point &point, const Parameters &k, PetscScalar g3[])
   {
@@ -162,6 +184,8 @@ public:
   virtual const PetscScalar *parameters(PetscInt *count) const = 0;
   virtual PetscPointFunc stress_callback() const = 0;
   virtual PetscPointJac tangent_callback() const = 0;
+  virtual EnergyDensity stored_callback() const = 0;
+  virtual EnergyDensity numerical_callback() const = 0;
   /// Strain energy density W at a state, kPa.
   virtual PetscScalar energy(const PointState &state) const = 0;
   /// P' = dW/dF at a state, kPa.
@@ -187,11 +211,9 @@ public:
   }
   PetscPointFunc stress_callback() const override { return volume_residual<Parameters, Kernels::stress>; }
   PetscPointJac tangent_callback() const override { return volume_jacobian<Parameters, Kernels::tangent>; }
-  PetscScalar energy(const PointState &state) const override
-  {
-    PetscScalar C[9];
-    return Law::energy(invariants(state, Law::uses_I2, C), parameters_).W;
-  }
+  EnergyDensity stored_callback() const override { return energy_density<Parameters, Kernels::stored>; }
+  EnergyDensity numerical_callback() const override { return energy_density<Parameters, Kernels::numerical>; }
+  PetscScalar energy(const PointState &state) const override { return Kernels::energy(state, parameters_); }
   void stress(const PointState &state, PetscScalar P[9]) const override
   {
     for (int i = 0; i < 9; ++i) P[i] = 0;

@@ -23,6 +23,9 @@ PIP, PEEP, INSPIRATION, PAUSE, EXPIRATION, RAMP, RAMP_DOWN, BREATHS, DT = 7.0, 2
 BREATHING = ["-ventilator_pip", PIP, "-ventilator_peep", PEEP, "-ventilator_inspiration", INSPIRATION,
              "-ventilator_pause", PAUSE, "-ventilator_expiration", EXPIRATION, "-ventilator_ramp", RAMP,
              "-ventilator_ramp_down", RAMP_DOWN, "-ventilator_breaths", BREATHS, "-ts_dt", DT]
+# numbers of a breath that need the fields (audit_test.py)
+NUMBERS_OF_FIELDS = {"auto_peep_cmH2O", "total_peep_cmH2O", "static_compliance_ml_per_cmH2O", "energy_j",
+                     "inspiratory_energy_j"}
 # slow enough to leave some gas behind
 GAS = ["-airflow_permeability", "300"]
 
@@ -118,7 +121,7 @@ class Breaths(unittest.TestCase):
     def test_files(self):
         snapshots = len(schedule()) + 1
         self.assertEqual(self.case.files(), sorted(
-            ["signals.csv", "summary.json", "fields.xdmf", "fields.h5"] + [f"fields_{i:05d}.h5" for i in range(snapshots)]))
+            ["signals.csv", "summary.json", "energy.csv", "fields.xdmf", "fields.h5"] + [f"fields_{i:05d}.h5" for i in range(snapshots)]))
         self.assertEqual(self.case.code, 0)
 
     def test_columns_and_first_row(self):
@@ -185,14 +188,33 @@ class Breaths(unittest.TestCase):
                 "peak_inspiratory_pressure_cmH2O": P.max(), "plateau_pressure_cmH2O": plateau,
                 "driving_pressure_cmH2O": plateau - PEEP, "tidal_volume_ml": V.max() - V[0],
                 "trapped_volume_ml": V[-1] - V[0], "peak_flow_ml_per_s": Q[1:].max(), "work_j": work,
-                "mechanical_power_j_per_min": work * 60 / (INSPIRATION + PAUSE + EXPIRATION)}
-            self.assertEqual(set(n), set(expected))
+                "mechanical_power_j_per_min": work * 60 / (INSPIRATION + PAUSE + EXPIRATION), "peep_cmH2O": PEEP,
+                "peak_expiratory_flow_ml_per_s": -Q[1:].min(),
+                "dynamic_compliance_ml_per_cmH2O": (V.max() - V[0]) / (PIP - PEEP), "strain": (V.max() - V[0]) / 0.99,
+                "pause_resistance_cmH2O_s_per_l": None, "static_curve_compliance_ml_per_cmH2O": None}
+            self.assertEqual(set(n), set(expected) | NUMBERS_OF_FIELDS)
             for name, value in expected.items():
-                self.assertAlmostEqual(n[name], value, delta=1e-9 * max(1, abs(value)), msg=name)
+                if value is None:
+                    self.assertIsNone(n[name], name)
+                else:
+                    self.assertAlmostEqual(n[name], value, delta=1e-9 * max(1, abs(value)), msg=name)
         last = self.summary["breaths"][-1]
-        for name in set(last) - {"compliance_ml_per_cmH2O", "resistance_cmH2O_s_per_l", "time_constant_s"}:
+        for name in set(last) - {"compliance_ml_per_cmH2O", "resistance_cmH2O_s_per_l", "time_constant_s",
+                                 "energy_j", "inspiratory_energy_j"}:
             self.assertEqual(self.summary[name], last[name], name)
         self.assertGreater(abs(self.summary["breaths"][0]["trapped_volume_ml"]), 1e-6)
+
+    def test_static_curve(self):
+        """The end of each pause, with the phase that it follows."""
+        curve = self.summary["static_curve"]
+        ends = [(p[3], before[0]) for before, p in zip(schedule(), schedule()[1:]) if p[0] == "pause"]
+        self.assertEqual([point["phase"] for point in curve], [name for _, name in ends])
+        for point, (end, _) in zip(curve, ends):
+            row = int(np.abs(self.rows["time_s"] - end).argmin())
+            self.assertEqual(set(point), {"time_s", "phase", "volume_ml", "pressure_cmH2O"})
+            self.assertAlmostEqual(point["time_s"], end, places=9)
+            self.assertAlmostEqual(point["volume_ml"], self.rows["volume_ml"][row], places=12)
+            self.assertAlmostEqual(point["pressure_cmH2O"], PIP, places=9)
 
     def test_summary_keys(self):
         s = self.summary
@@ -316,9 +338,10 @@ class Breaths(unittest.TestCase):
             self.assertNotIn(word, text)
 
     def test_numbers_in_words(self):
-        for number in (f"{self.summary['compliance_ml_per_cmH2O']:.2f} ml/cmH2O",
-                       f"{self.summary['resistance_cmH2O_s_per_l']:.3f} cmH2O s/l",
-                       f"{self.summary['tidal_volume_ml']:.1f} ml", self.case.path("summary.json"),
+        self.assertAlmostEqual(self.summary["functional_residual_capacity_ml"], 0.99, places=9)
+        for number in (f"{self.summary['compliance_ml_per_cmH2O']:.4g} ml/cmH2O",
+                       f"{self.summary['resistance_cmH2O_s_per_l']:.4g} cmH2O s/l",
+                       f"{self.summary['tidal_volume_ml']:.4g} ml", self.case.path("summary.json"),
                        self.case.path("signals.csv"), self.case.path("fields.xdmf")):
             self.assertIn(number, self.case.out)
 
@@ -396,7 +419,7 @@ class OtherScenes(unittest.TestCase):
         with open(first.path("notes.txt"), "w") as f:
             f.write("the user's own\n")
         again = pulmo.finished(base + ["-airflow", "off", "-output_overwrite"], directory=first.directory)
-        self.assertEqual(again.files(), sorted(["fields.h5", "fields.xdmf", "fields_00000.h5", "fields_00001.h5",
+        self.assertEqual(again.files(), sorted(["energy.csv", "fields.h5", "fields.xdmf", "fields_00000.h5", "fields_00001.h5",
                                                 "notes.txt", "signals.csv", "summary.json"]))
 
     def test_several_runs_share_no_file(self):
@@ -423,7 +446,7 @@ class Help(unittest.TestCase):
         "-ventilator_breaths": "-", "-lumen_pressure": "on/off", "-lumen_pressure_surfaces": None, "-support": "on/off",
         "-support_rigid": "on/off", "-support_surfaces": None, "-traction": "on/off", "-traction_surfaces": None,
         "-traction_value": "kPa", "-quadrature_degree": "-", "-output_dir": "text", "-output_overwrite": "on/off",
-        "-output_fields_every": "s", "-progress": "on/off", "-effects_view": "on/off"}
+        "-output_fields_every": "s", "-progress": "on/off", "-effects_view": "on/off", "-energy_audit": "on/off"}
 
     def test_every_option_with_its_unit(self):
         case = pulmo.finished(["-help"])

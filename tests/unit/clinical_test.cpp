@@ -48,12 +48,12 @@ TEST(Fit, RecoversElastanceAndResistance)
     for (int breaths : {1, 3}) {
       const double E = 0.0125, R = 0.0042; // cmH2O/ml, cmH2O s/ml
       const auto rows = compartment(E, R, peep, breaths, peep > 0 ? 300 : 0, 7);
-      ClinicalNumbers n = overall_numbers(rows, peep);
+      ClinicalNumbers n = overall_numbers(rows);
       ASSERT_TRUE(n.compliance && n.resistance && n.time_constant);
       EXPECT_NEAR(*n.compliance, 80, 80 * 1e-10);
       EXPECT_NEAR(*n.resistance, 4.2, 4.2 * 1e-10);
       EXPECT_NEAR(*n.time_constant, 4.2e-3 * 80, 1e-10);
-      const auto each = breath_numbers(rows, peep);
+      const auto each = breath_numbers(rows);
       ASSERT_EQ(each.size(), static_cast<std::size_t>(breaths));
       for (const ClinicalNumbers &b : each) {
         ASSERT_TRUE(b.compliance);
@@ -136,10 +136,10 @@ TEST(Fit, StaysEmptyWhereTheRowsDefineNothing)
   fit_single_compartment(rows, 1, 1, 0, n);
   EXPECT_FALSE(n.compliance);
 
-  EXPECT_TRUE(breath_numbers({}, 0).empty());
-  EXPECT_FALSE(overall_numbers({}, 0).compliance);
-  EXPECT_TRUE(breath_numbers(std::vector<SignalRow>(3), 0).empty()); // nothing but settling
-  EXPECT_EQ(clinical_numbers(std::vector<SignalRow>(1), 0, 0, 0).mechanical_power, 0);
+  EXPECT_TRUE(breath_numbers({}).empty());
+  EXPECT_FALSE(overall_numbers({}).compliance);
+  EXPECT_TRUE(breath_numbers(std::vector<SignalRow>(3)).empty()); // nothing but settling
+  EXPECT_EQ(clinical_numbers(std::vector<SignalRow>(1), 0, 0).mechanical_power, 0);
 }
 
 /// Rows of a breath: PEEP 5, constant flow 500 ml/s for 1 s, pause, passive expiration in two steps.
@@ -175,7 +175,7 @@ std::vector<SignalRow> breath_with_pause()
 TEST(Numbers, OfABreathWithAPause)
 {
   const auto rows = breath_with_pause();
-  const auto list = breath_numbers(rows, 5);
+  const auto list = breath_numbers(rows);
   ASSERT_EQ(list.size(), 1u);
   const ClinicalNumbers &n = list[0];
   EXPECT_DOUBLE_EQ(n.peak_pressure, 20);
@@ -189,7 +189,7 @@ TEST(Numbers, OfABreathWithAPause)
   const double work = (1250 + 3125 - 2200) * 0.0980665e-3;
   EXPECT_NEAR(n.work, work, 1e-14);
   EXPECT_NEAR(n.mechanical_power, work * 60 / 3.5, 1e-12);
-  const ClinicalNumbers overall = overall_numbers(rows, 5);
+  const ClinicalNumbers overall = overall_numbers(rows);
   EXPECT_DOUBLE_EQ(overall.tidal_volume, 500);
   EXPECT_DOUBLE_EQ(overall.work, n.work);
 }
@@ -210,7 +210,7 @@ TEST(Numbers, WorkOfAResistiveLoop)
     r.breath = 1;
     rows.push_back(r);
   }
-  const ClinicalNumbers numbers = clinical_numbers(rows, 0, n, 8);
+  const ClinicalNumbers numbers = clinical_numbers(rows, 0, n);
   const double exact = R * 250 * 250 * M_PI * M_PI * 0.0980665e-3; // J
   EXPECT_NEAR(numbers.work, exact, 1e-6 * exact);
   EXPECT_NEAR(numbers.mechanical_power, 30 * exact, 3e-5 * exact);
@@ -221,14 +221,230 @@ TEST(Numbers, OverallFitsAllBreathsAndTakesTheRestFromTheLast)
   auto rows = compartment(0.0125, 0.0042, 0, 2, 0, 9);
   for (SignalRow &r : rows)
     if (r.breath == 2) r.pressure *= 2; // the second breath is stiffer
-  const ClinicalNumbers overall = overall_numbers(rows, 0);
-  const auto each = breath_numbers(rows, 0);
+  const ClinicalNumbers overall = overall_numbers(rows);
+  const auto each = breath_numbers(rows);
   EXPECT_NEAR(*each[0].compliance, 80, 1e-6);
   EXPECT_NEAR(*each[1].compliance, 40, 40 * 0.01); // its start row is of the first
   EXPECT_LT(*overall.compliance, 79);
   EXPECT_GT(*overall.compliance, 41);
   EXPECT_DOUBLE_EQ(overall.peak_pressure, each[1].peak_pressure);
   EXPECT_DOUBLE_EQ(overall.work, each[1].work);
+}
+
+// ------------------------------------------------- exact solutions of a single compartment P = PEEP + E V + R V'
+
+/// A compartment that a ventilator drives; V is its volume above the one that it has at the first PEEP. Rows are exact.
+struct Compartment {
+  static constexpr double soon = 1e-6; ///< s: a phase's first row, so that the trapezoid sees its jump
+  double E = 0.0125, R = 0.0042, peep; ///< cmH2O/ml, cmH2O s/ml, cmH2O
+  double tube = 0;                     ///< resistance between machine and airway, cmH2O s/ml
+  double t = 0, V = 0;
+  std::vector<SignalRow> rows;
+
+  explicit Compartment(double from = 5) : peep(from) { add(0, 0, peep, "settle", 0); }
+  double tau() const { return R / E; }
+  void add(double dt, double Q, double P, const char *phase, int breath, bool hold = false)
+  {
+    SignalRow r;
+    t += dt;
+    r.time = t;
+    r.dt = dt;
+    r.volume = V;
+    r.flow = Q;
+    r.pressure = P;
+    if (tube > 0) r.ventilator_pressure = P + tube * Q;
+    r.alveolar_pressure = peep + E * V;
+    r.phase = phase;
+    r.breath = breath;
+    r.hold = hold;
+    rows.push_back(r);
+  }
+  /// Calls row(time since the start of the phase, step) for T seconds in n + 1 rows.
+  template <class Row>
+  void phase_of(double T, int n, Row &&row)
+  {
+    row(soon, soon);
+    for (int i = 1; i <= n; ++i) row(T * i / n, i == 1 ? T / n - soon : T / n);
+  }
+  /// Flow Q for T seconds.
+  void flow(double Q, double T, int n, const char *phase, int breath)
+  {
+    const double start = V;
+    phase_of(T, n, [&](double since, double dt) {
+      V = start + Q * since;
+      add(dt, Q, peep + E * V + R * Q, phase, breath, Q == 0);
+    });
+  }
+  /// Airway pressure P for T seconds: V -> (P - PEEP)/E.
+  void pressure(double P, double T, int n, const char *phase, int breath)
+  {
+    const double start = V, target = (P - peep) / E;
+    phase_of(T, n, [&](double since, double dt) {
+      const double decay = std::exp(-since / tau());
+      V = target + (start - target) * decay;
+      add(dt, (target - start) / tau() * decay, P, phase, breath);
+    });
+  }
+};
+
+TEST(ExactCompartment, VolumeControlWithPause)
+{
+  Compartment lung;
+  const double Q = 500, T = 1, expiration = 0.8;
+  for (int breath = 1; breath <= 3; ++breath) {
+    lung.flow(Q, T, 8, "inspiration", breath);
+    lung.flow(0, 0.25, 2, "pause", breath);
+    lung.pressure(lung.peep, expiration, 400, "expiration", breath);
+  }
+  const auto list = breath_numbers(lung.rows);
+  ASSERT_EQ(list.size(), 3u);
+  double start = 0; // volume that earlier breaths left behind
+  for (const ClinicalNumbers &n : list) {
+    const double full = start + Q * T, end = full * std::exp(-expiration / lung.tau());
+    EXPECT_NEAR(n.peep, 5, 1e-12);
+    EXPECT_NEAR(n.tidal_volume, Q * T, 1e-9);
+    EXPECT_NEAR(n.trapped_volume, end - start, 1e-9);
+    EXPECT_NEAR(n.peak_pressure, 5 + lung.E * full + lung.R * Q, 1e-9);
+    ASSERT_TRUE(n.plateau_pressure && n.pause_resistance && n.static_compliance && n.auto_peep && n.total_peep);
+    EXPECT_NEAR(*n.plateau_pressure, 5 + lung.E * full, 1e-9);
+    EXPECT_NEAR(n.driving_pressure, lung.E * full, 1e-9);
+    EXPECT_NEAR(*n.pause_resistance, 4.2, 1e-9);
+    EXPECT_NEAR(*n.static_compliance, 80, 1e-8); // whatever the trapped volume
+    EXPECT_NEAR(*n.dynamic_compliance, Q * T / (lung.E * full + lung.R * Q), 1e-9);
+    EXPECT_NEAR(*n.auto_peep, lung.E * end, 1e-9);
+    EXPECT_NEAR(*n.total_peep, 5 + lung.E * end, 1e-9);
+    EXPECT_NEAR(n.peak_flow, Q, 1e-12);
+    EXPECT_NEAR(n.peak_expiratory_flow, full / lung.tau(), 1e-4 * full);
+    EXPECT_FALSE(n.static_curve_compliance); // one point is no curve
+    // inspiration: E V dV + R Q dV; expiration: none
+    const double work = (lung.E * (full * full - start * start) / 2 + lung.R * Q * Q * T) * 0.0980665e-3;
+    EXPECT_NEAR(n.work, work, 1e-4 * work);
+    EXPECT_NEAR(n.mechanical_power, n.work * 60 / (T + 0.25 + expiration), 1e-9);
+    start = end;
+  }
+  ASSERT_TRUE(list[0].compliance);
+  EXPECT_NEAR(*list[0].compliance, 80, 1e-6);
+  EXPECT_NEAR(*list[0].resistance, 4.2, 1e-7);
+  const ClinicalNumbers overall = overall_numbers(lung.rows);
+  EXPECT_NEAR(*overall.compliance, 80, 1e-6); // all breaths: volume above the first one's start
+  EXPECT_NEAR(*overall.time_constant, lung.tau(), 1e-9);
+  EXPECT_NEAR(*overall.auto_peep, lung.E * start, 1e-9);
+
+  const auto points = static_points(lung.rows, 0, lung.rows.size() - 1);
+  ASSERT_EQ(points.size(), 3u);
+  for (const StaticPoint &p : points) {
+    EXPECT_EQ(p.phase, "inspiration");
+    EXPECT_EQ(lung.rows[p.row].phase, "pause");
+    EXPECT_EQ(lung.rows[p.row + 1].phase, "expiration");
+  }
+}
+
+TEST(ExactCompartment, PressureControl)
+{
+  Compartment lung;
+  const double pip = 15, inspiration = 0.7, pause = 0.3, expiration = 0.9;
+  lung.pressure(pip, inspiration, 50, "inspiration", 1);
+  lung.pressure(pip, pause, 20, "pause", 1); // the machine keeps pressing: gas still flows
+  lung.pressure(lung.peep, expiration, 60, "expiration", 1);
+  const ClinicalNumbers n = overall_numbers(lung.rows);
+  const double full = 800 * (1 - std::exp(-(inspiration + pause) / lung.tau()));
+  EXPECT_NEAR(n.tidal_volume, full, 1e-9);
+  EXPECT_NEAR(n.peak_pressure, pip, 1e-12);
+  EXPECT_NEAR(*n.plateau_pressure, pip, 1e-12);
+  EXPECT_NEAR(n.driving_pressure, 10, 1e-12);
+  EXPECT_NEAR(n.peak_flow, 10 / lung.R, 1e-5 * 10 / lung.R);
+  EXPECT_NEAR(n.peak_expiratory_flow, full / lung.tau(), 1e-5 * full / lung.tau());
+  EXPECT_NEAR(*n.dynamic_compliance, full / 10, 1e-9);
+  EXPECT_NEAR(*n.compliance, 80, 1e-8);
+  EXPECT_NEAR(*n.resistance, 4.2, 1e-9);
+  EXPECT_FALSE(n.pause_resistance) << "no resistance from a pause in which gas flows";
+  EXPECT_NEAR(*n.auto_peep, lung.E * full * std::exp(-expiration / lung.tau()), 1e-9);
+}
+
+TEST(ExactCompartment, ReadsTheMachinesSideOfATube)
+{
+  Compartment lung;
+  lung.tube = 0.003;
+  lung.flow(400, 1, 10, "inspiration", 1);
+  lung.flow(0, 0.3, 3, "pause", 1);
+  lung.pressure(lung.peep, 2, 100, "expiration", 1);
+  const ClinicalNumbers n = overall_numbers(lung.rows);
+  EXPECT_NEAR(n.peak_pressure, 5 + lung.E * 400 + (lung.R + lung.tube) * 400, 1e-9);
+  EXPECT_NEAR(*n.plateau_pressure, 5 + lung.E * 400, 1e-9);
+  EXPECT_NEAR(*n.pause_resistance, 7.2, 1e-9);
+  EXPECT_NEAR(*n.resistance, 7.2, 1e-6);
+  EXPECT_NEAR(*n.static_compliance, 80, 1e-8);
+}
+
+TEST(ExactCompartment, SupersyringeGivesTheStaticCurve)
+{
+  Compartment lung(0);
+  const int steps = 5;
+  for (int k = 0; k < steps; ++k) {
+    lung.flow(300, 0.3, 4, "inflation", 1);
+    lung.flow(0, 2, 3, "pause", 1);
+  }
+  for (int k = 0; k < steps; ++k) {
+    lung.flow(-300, 0.3, 4, "deflation", 1);
+    lung.flow(0, 2, 3, "pause", 1);
+  }
+  const auto points = static_points(lung.rows, 0, lung.rows.size() - 1);
+  ASSERT_EQ(points.size(), 2u * steps);
+  for (int k = 0; k < 2 * steps; ++k) {
+    const SignalRow &r = lung.rows[points[k].row];
+    EXPECT_EQ(points[k].phase, k < steps ? "inflation" : "deflation");
+    EXPECT_NEAR(r.time, 2.3 * (k + 1), 1e-9);
+    EXPECT_NEAR(r.volume, 90 * (k < steps ? k + 1 : 2 * steps - 1 - k), 1e-9);
+    EXPECT_NEAR(r.pressure, lung.E * r.volume, 1e-9);
+  }
+  const ClinicalNumbers n = overall_numbers(lung.rows);
+  EXPECT_NEAR(*n.static_curve_compliance, 80, 1e-8);
+  EXPECT_NEAR(*n.static_compliance, 80, 1e-8);
+  EXPECT_NEAR(*n.plateau_pressure, lung.E * 450, 1e-9); // the fullest pause, not the last
+  EXPECT_NEAR(*n.pause_resistance, 4.2, 1e-9);
+}
+
+TEST(ExactCompartment, StaticCurveOfACurvedLung)
+{
+  // P = E V + V^2 / 1e6 at the pauses: the slope of pressure on volume by the sums of a textbook, inflation limb only
+  Compartment lung;
+  double x = 0, y = 0, xx = 0, xy = 0;
+  for (int k = 1; k <= 4; ++k) {
+    lung.flow(200, 0.5, 2, "filling", 1);
+    lung.V = 100. * k;
+    const double P = lung.E * lung.V + lung.V * lung.V * 1e-6;
+    lung.add(1, 0, P, "wait", 1, true); // a hold by any name
+    x += lung.V, y += P, xx += lung.V * lung.V, xy += lung.V * P;
+  }
+  for (int k = 3; k >= 1; --k) {
+    lung.flow(-200, 0.5, 2, "emptying", 1);
+    lung.add(1, 0, 100, "wait", 1, true); // nonsense that must not enter
+  }
+  const ClinicalNumbers n = overall_numbers(lung.rows);
+  ASSERT_TRUE(n.static_curve_compliance);
+  EXPECT_NEAR(*n.static_curve_compliance, (4 * xx - x * x) / (4 * xy - x * y), 1e-9);
+  const auto points = static_points(lung.rows, 0, lung.rows.size() - 1);
+  ASSERT_EQ(points.size(), 7u);
+  EXPECT_EQ(points[6].phase, "emptying");
+}
+
+TEST(Numbers, AreEmptyWhereABreathDoesNotDefineThem)
+{
+  Compartment lung; // no pause
+  lung.pressure(12, 1, 20, "inspiration", 1);
+  lung.pressure(5, 2, 20, "expiration", 1);
+  for (SignalRow &r : lung.rows) r.alveolar_pressure.reset(); // as without airflow
+  const ClinicalNumbers n = overall_numbers(lung.rows);
+  EXPECT_FALSE(n.plateau_pressure || n.pause_resistance || n.static_compliance || n.static_curve_compliance);
+  EXPECT_FALSE(n.auto_peep || n.total_peep);
+  EXPECT_TRUE(n.dynamic_compliance);
+  EXPECT_TRUE(static_points(lung.rows, 0, lung.rows.size() - 1).empty());
+
+  Compartment still; // a breath in which nothing happens
+  still.flow(0, 1, 3, "pause", 1);
+  const ClinicalNumbers m = overall_numbers(still.rows);
+  EXPECT_FALSE(m.dynamic_compliance || m.static_compliance || m.pause_resistance || m.compliance);
+  EXPECT_EQ(m.tidal_volume, 0);
 }
 
 } // namespace

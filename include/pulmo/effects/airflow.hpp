@@ -66,6 +66,14 @@ struct DarcyKernels {
     for (int i = 0; i < 3; ++i) b[i] = cof[3 * i] * g[0] + cof[3 * i + 1] * g[1] + cof[3 * i + 2] * g[2];
     for (int I = 0; I < 3; ++I) f1[I] += k_J * (cof[I] * b[0] + cof[3 + I] * b[1] + cof[6 + I] * b[2]);
   }
+  /// Heat of the flow in a step: dt Q . K^-1 Q = dt k/J |cof Grad p|^2, kPa.
+  static PetscScalar dissipation(const Point &point, const Point &, const Parameters &parameters)
+  {
+    const PetscScalar *g = point.grad_p;
+    PetscScalar f1[3] = {0, 0, 0};
+    flux(point, parameters, f1);
+    return point.step.dt * (f1[0] * g[0] + f1[1] * g[1] + f1[2] * g[2]);
+  }
   /// g3 of (mass, pressure): k/J cof^T cof.
   static void flux_by_pressure(const Point &point, const Parameters &parameters, PetscScalar g3[])
   {
@@ -170,6 +178,8 @@ public:
                nullptr, nullptr);
     c.jacobian("flux", pressure, displacement, nullptr, nullptr, nullptr, darcy.flux_by_displacement_callback());
     c.jacobian("flux", pressure, pressure, nullptr, nullptr, nullptr, darcy.flux_by_pressure_callback());
+    c.energy(Energy::dissipated, "resistive", "", darcy.dissipation_callback());
+    c.energy(Energy::numerical, "numerical_dissipation", "", energy_density<P, numerical_gas_loss>);
     for (const std::string &surface : surfaces_) {
       Constraint open;
       open.name = "airway pressure";

@@ -40,6 +40,35 @@ struct ChestWallKernels {
       for (int j = 0; j < 3; ++j) g0[3 * i + j] += k.stiffness[I] * (k.normal_only != 0 ? N[i] * N[j] : i == j);
   }
 
+  /// K_s a . b, or K_s (a . N) (b . N).
+  static PetscScalar product(const Parameters &k, std::size_t i, const PetscScalar a[3], const PetscScalar b[3],
+                             const PetscReal N[3])
+  {
+    const auto dot = [](const PetscScalar x[3], const PetscScalar y[3]) {
+      return x[0] * y[0] + x[1] * y[1] + x[2] * y[2];
+    };
+    return k.stiffness[i] * (k.normal_only != 0 ? dot(a, N) * dot(b, N) : dot(a, b));
+  }
+  /// Growth of 1/2 K_s |u|^2 over a step, kPa mm.
+  template <std::size_t I>
+  static PetscScalar stored(const Point &now, const Point &before, const Parameters &k)
+  {
+    PetscScalar middle[3], step[3];
+    for (int i = 0; i < 3; ++i) {
+      middle[i] = (now.u[i] + before.u[i]) / 2;
+      step[i] = now.u[i] - before.u[i];
+    }
+    return product(k, I, middle, step, now.normal);
+  }
+  /// What backward Euler loses in the springs: 1/2 K_s |du|^2, kPa mm.
+  template <std::size_t I>
+  static PetscScalar numerical(const Point &now, const Point &before, const Parameters &k)
+  {
+    PetscScalar step[3];
+    for (int i = 0; i < 3; ++i) step[i] = now.u[i] - before.u[i];
+    return product(k, I, step, step, now.normal) / 2;
+  }
+
   /// The callbacks of each surface, so that a kernel knows its stiffness.
   template <std::size_t... I>
   static constexpr std::array<PetscBdPointFunc, sizeof...(I)> residuals(std::index_sequence<I...>)
@@ -50,6 +79,16 @@ struct ChestWallKernels {
   static constexpr std::array<PetscBdPointJac, sizeof...(I)> jacobians(std::index_sequence<I...>)
   {
     return {surface_jacobian<Parameters, spring_tangent<I>>...};
+  }
+  template <std::size_t... I>
+  static constexpr std::array<EnergyDensity, sizeof...(I)> stored_energies(std::index_sequence<I...>)
+  {
+    return {energy_density<Parameters, stored<I>>...};
+  }
+  template <std::size_t... I>
+  static constexpr std::array<EnergyDensity, sizeof...(I)> numerical_losses(std::index_sequence<I...>)
+  {
+    return {energy_density<Parameters, numerical<I>>...};
   }
 };
 
@@ -93,8 +132,11 @@ public:
   PetscErrorCode terms(Composition &c, const SceneFacts &) const override
   {
     using K = ChestWallKernels;
-    static constexpr auto residuals = K::residuals(std::make_index_sequence<K::max_surfaces>());
-    static constexpr auto jacobians = K::jacobians(std::make_index_sequence<K::max_surfaces>());
+    static constexpr auto each = std::make_index_sequence<K::max_surfaces>();
+    static constexpr auto residuals = K::residuals(each);
+    static constexpr auto jacobians = K::jacobians(each);
+    static constexpr auto stored = K::stored_energies(each);
+    static constexpr auto numerical = K::numerical_losses(each);
 
     PetscFunctionBeginUser;
     c.parameters(parameters_);
@@ -102,6 +144,8 @@ public:
       if (parameters_.stiffness[i] == 0) continue;
       c.surface_residual("K_s u . eta", surfaces_[i], displacement, residuals[i], nullptr);
       c.surface_jacobian("K_s", surfaces_[i], displacement, displacement, jacobians[i], nullptr, nullptr, nullptr);
+      c.energy(Energy::stored, "elastic_springs", surfaces_[i], stored[i]);
+      c.energy(Energy::numerical, "numerical_dissipation", surfaces_[i], numerical[i]);
     }
     PetscFunctionReturn(PETSC_SUCCESS);
   }

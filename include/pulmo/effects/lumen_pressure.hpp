@@ -35,6 +35,14 @@ struct LumenPressureKernels {
     const PetscReal *N = point.normal;
     for (int i = 0; i < 3; ++i) g0[i] += (cof[3 * i] * N[0] + cof[3 * i + 1] * N[1] + cof[3 * i + 2] * N[2]);
   }
+  /// Work of the wall pressure on the lung in a step: -p cof F N . du, kPa mm.
+  static PetscScalar work(const Point &now, const Point &before, const NoParameters &parameters)
+  {
+    PetscScalar f0[3] = {0, 0, 0}, sum = 0;
+    wall(now, parameters, f0);
+    for (int i = 0; i < 3; ++i) sum -= f0[i] * (now.u[i] - before.u[i]);
+    return sum;
+  }
 };
 
 class LumenPressure final : public Effect {
@@ -75,6 +83,7 @@ public:
       if (facts.airflow)
         c.surface_jacobian("wall pressure", surface, displacement, pressure, surface_jacobian<P, K::wall_by_pressure>,
                            nullptr, nullptr, nullptr);
+      c.energy(Energy::external, "external", surface, energy_density<P, K::work>);
     }
     PetscFunctionReturn(PETSC_SUCCESS);
   }

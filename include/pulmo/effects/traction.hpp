@@ -25,10 +25,24 @@ struct TractionKernels {
     for (int i = 0; i < 3; ++i) f0[i] -= k.value[I][i];
   }
 
+  /// Work of the load in a step: T . du, kPa mm.
+  template <std::size_t I>
+  static PetscScalar work(const Point &now, const Point &before, const Parameters &k)
+  {
+    PetscScalar sum = 0;
+    for (int i = 0; i < 3; ++i) sum += k.value[I][i] * (now.u[i] - before.u[i]);
+    return sum;
+  }
+
   template <std::size_t... I>
   static constexpr std::array<PetscBdPointFunc, sizeof...(I)> residuals(std::index_sequence<I...>)
   {
     return {surface_residual<Parameters, load<I>>...};
+  }
+  template <std::size_t... I>
+  static constexpr std::array<EnergyDensity, sizeof...(I)> works(std::index_sequence<I...>)
+  {
+    return {energy_density<Parameters, work<I>>...};
   }
 };
 
@@ -69,13 +83,16 @@ public:
 
   PetscErrorCode terms(Composition &c, const SceneFacts &) const override
   {
-    static constexpr auto residuals =
-        TractionKernels::residuals(std::make_index_sequence<TractionKernels::max_surfaces>());
+    static constexpr auto each = std::make_index_sequence<TractionKernels::max_surfaces>();
+    static constexpr auto residuals = TractionKernels::residuals(each);
+    static constexpr auto works = TractionKernels::works(each);
 
     PetscFunctionBeginUser;
     c.parameters(parameters_);
-    for (std::size_t i = 0; i < surfaces_.size(); ++i)
+    for (std::size_t i = 0; i < surfaces_.size(); ++i) {
       c.surface_residual("-T . eta", surfaces_[i], displacement, residuals[i], nullptr);
+      c.energy(Energy::external, "external", surfaces_[i], works[i]);
+    }
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 

@@ -115,6 +115,7 @@ public:
       c.jacobian("gas stress", displacement, displacement, nullptr, nullptr, nullptr,
                  volume_jacobian<P, K::gas_stress_by_displacement>);
       if (facts.common_pressure()) c.solve_for_gas_pressure();
+      c.energy(Energy::numerical, "numerical_dissipation", "", energy_density<P, numerical_gas_loss>);
     }
     if (facts.free_airway())
       for (const std::string &surface : facts.airway_surfaces)
@@ -148,8 +149,6 @@ public:
     }
     return Programme(b.take());
   }
-  /// cmH2O.
-  PetscReal peep() const { return peep_; }
 
 private:
   /// Settings that contradict one another.

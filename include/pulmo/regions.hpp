@@ -1,0 +1,47 @@
+/// @file
+/// The lung part by part: volume, deformation and alveolar pressure of the whole, of each body and of each named part.
+#pragma once
+
+#include "pulmo/mesh.hpp"
+#include "pulmo/sampling.hpp"
+#include "pulmo/simulation.hpp"
+
+namespace pulmo {
+
+/// What a region is like at one time; means are over its reference volume.
+struct RegionState {
+  double volume_change = 0; ///< int (J - 1), ml
+  double mean_J = 1, sd_J = 0;
+  double mean_pressure = 0, sd_pressure = 0; ///< alveolar, cmH2O (without airflow: the uniform gas pressure)
+};
+
+/// Follows all regions over the accepted steps.
+class RegionAudit final : public Observer {
+public:
+  RegionAudit(const Scene &scene, const Model &model, const Sampling &sampling)
+      : scene_(scene), model_(model), sampling_(sampling)
+  {}
+
+  /// After the model was built and the sampling set up.
+  PetscErrorCode setup();
+  PetscErrorCode observe(const StepReport &step) override;
+
+  const std::vector<Mesh::Region> &regions() const { return regions_; }
+  /// Reference volume of a region, ml.
+  double volume(std::size_t region) const { return volumes_[region]; }
+  /// State of a region at a row of the signals.
+  const RegionState &state(std::size_t row, std::size_t region) const { return rows_[row][region]; }
+  /// The signals with the mean alveolar pressure of the whole lung filled in.
+  std::vector<SignalRow> complete(std::vector<SignalRow> rows) const;
+
+private:
+  const Scene &scene_;
+  const Model &model_;
+  const Sampling &sampling_;
+  std::vector<Mesh::Region> regions_;
+  std::vector<std::vector<std::size_t>> regions_of_; ///< [cell]; the last entry of a row stands for the whole lung
+  std::vector<double> volumes_;
+  std::vector<std::vector<RegionState>> rows_; ///< [row][region], the whole lung last
+};
+
+} // namespace pulmo
