@@ -407,9 +407,16 @@ PetscErrorCode Simulation::after_step()
   PetscCall(VecScale(rate_, 1 / row.dt));
   PetscCall(model_.measure(local_, measures));
   row.volume = measures.volume_change / units::mm3_per_ml;
+  if (scene_.facts().airflow || model_.composition().supported())
+    PetscCall(model_.residual(t, local_, rate_, local_residual_));
+  if (model_.composition().supported()) {
+    std::vector<std::array<PetscReal, 3>> forces;
+    PetscCall(model_.reactions(local_residual_, forces));
+    for (const auto &force : forces)
+      for (const PetscReal f : force) worst_reaction_ = std::max(worst_reaction_, std::abs(f));
+  }
   if (scene_.facts().airflow) {
     PetscReal flow;
-    PetscCall(model_.residual(t, local_, rate_, local_residual_));
     PetscCall(model_.airway_flow(local_residual_, flow));
     row.flow = flow / units::mm3_per_ml;
   } else {
