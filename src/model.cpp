@@ -621,17 +621,17 @@ PetscErrorCode Model::airway_flow(Vec F, PetscReal &flow) const
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Model::reaction(Vec F, PetscReal force[3]) const
+PetscErrorCode Model::reactions(Vec F, std::vector<std::array<PetscReal, 3>> &forces) const
 {
   const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
 
   PetscFunctionBeginUser;
-  force[0] = force[1] = force[2] = 0;
+  forces.assign(composition().constraints().size(), {0, 0, 0});
   const ReadArray f(F);
   for (const Prescribed &p : prescribed_)
     if (composition().constraints()[p.constraint].field == displacement)
-      force[p.component] += f[p.dof] / row_scale_[displacement];
-  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, force, 3, MPIU_REAL, MPI_SUM, comm));
+      forces[p.constraint][p.component] += f[p.dof] / row_scale_[displacement];
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, forces.data(), 3 * (PetscMPIInt)forces.size(), MPIU_REAL, MPI_SUM, comm));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -536,11 +536,19 @@ PetscErrorCode Simulation::after_step()
   PetscCall(VecScale(rate_, 1 / row.dt));
   PetscCall(model_.measure(local_, measures));
   row.volume = measures.volume_change / units::mm3_per_ml;
-  if (airway_.mode() == Airway::Mode::free) {
+  const bool free = airway_.mode() == Airway::Mode::free, airflow = scene_.facts().airflow,
+             supported = model_.composition().supported();
+  if ((airflow && !free) || supported) PetscCall(model_.residual(t, local_, rate_, local_residual_));
+  if (supported) {
+    std::vector<std::array<PetscReal, 3>> forces;
+    PetscCall(model_.reactions(local_residual_, forces));
+    for (const auto &force : forces)
+      for (const PetscReal f : force) worst_reaction_ = std::max(worst_reaction_, std::abs(f));
+  }
+  if (free) {
     row.flow = airway_.flow() / units::mm3_per_ml;
-  } else if (scene_.facts().airflow) {
+  } else if (airflow) {
     PetscReal flow;
-    PetscCall(model_.residual(t, local_, rate_, local_residual_));
     PetscCall(model_.airway_flow(local_residual_, flow));
     row.flow = flow / units::mm3_per_ml;
   } else {

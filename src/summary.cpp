@@ -198,6 +198,8 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
     json["surface_area_mm2"] = total;
     json["surface_areas_mm2"] = areas;
     if (scene.facts().airflow) json["mass_balance_error_ml"] = simulation.mass_balance_error() / units::mm3_per_ml;
+    if (model.composition().supported())
+      json["support_reaction_n"] = simulation.support_reaction() * units::newton_per_kPa_mm2;
     json["min_jacobian"] = simulation.min_J();
     json["end_time_s"] = simulation.time();
     json["steps"] = simulation.rows().size() - 1;

@@ -158,12 +158,18 @@ public:
   void solve_for_gas_pressure() { common_gas_pressure_ = true; }
   bool common_gas_pressure() const { return common_gas_pressure_; }
 
+  /// Whether displacement is prescribed anywhere.
+  bool supported() const
+  {
+    for (const Constraint &c : constraints_)
+      if (c.field == displacement) return true;
+    return false;
+  }
   /// Whether anything at all holds the lung: a prescribed displacement, or a term that resists displacement itself.
   /// (It may still be too little to stop every rigid motion.)
   bool held() const
   {
-    for (const Constraint &c : constraints_)
-      if (c.field == displacement) return true;
+    if (supported()) return true;
     for (const Term &t : terms_)
       if (t.test == displacement && t.trial == displacement && (t.g0 || t.bd_g0)) return true;
     return false;

@@ -5,6 +5,8 @@
 #include "pulmo/assembly.hpp"
 #include "pulmo/effect.hpp"
 
+#include <array>
+
 namespace pulmo {
 
 /// The equations of a scene on its mesh.
@@ -61,8 +63,9 @@ public:
   /// Flow into the lung, mm^3/s: the consistent flux, from a local residual. Where p is held the mass residual
   /// is - int Q.N q; summed over the nodes where the lung is open it is exactly the rate of int (J - 1).
   PetscErrorCode airway_flow(Vec F, PetscReal &flow) const;
-  /// Sum of the constrained displacement rows of a local residual: the force that supports bear, kPa mm^2.
-  PetscErrorCode reaction(Vec F, PetscReal force[3]) const;
+  /// Force that each of the composition's constraints bears (a pin, a held surface), from a local residual, kPa mm^2:
+  /// the sum of its displacement rows.
+  PetscErrorCode reactions(Vec F, std::vector<std::array<PetscReal, 3>> &forces) const;
 
   PetscReal row_scale(PetscInt field) const { return row_scale_[field]; }
   PetscReal modulus() const { return modulus_; } ///< tissue stiffness that scales the equations, kPa

@@ -60,6 +60,7 @@ public:
   const std::vector<SignalRow> &rows() const { return rows_; }
   PetscReal mass_balance_error() const { return worst_balance_; } ///< largest of the run, mm^3
   PetscReal min_J() const { return min_J_; }
+  PetscReal support_reaction() const { return worst_reaction_; } ///< largest force component of the run, kPa mm^2
   PetscInt rejected_steps() const { return rejected_; }
   const StageSeconds &seconds() const { return seconds_; }
   /// One paragraph on a run that could not go on: where, when, what was tried, what to try.
@@ -109,7 +110,7 @@ private:
   PetscReal end_ = 0;
   SignalRow accepted_;
   std::vector<SignalRow> rows_;
-  PetscReal delivered_ = 0, worst_balance_ = 0, min_J_ = 1;
+  PetscReal delivered_ = 0, worst_balance_ = 0, worst_reaction_ = 0, min_J_ = 1;
   PetscInt newton_ = 0, krylov_ = 0, rejected_ = 0;
   int extra_newton_ = 0;  ///< Newton steps of the attempt at hand for the prescribed volume alone
   bool inverted_ = false; ///< the attempt at hand met J <= 0
