@@ -293,7 +293,7 @@ PetscErrorCode Assembly::residual(Part part, PetscReal t, Vec x, Vec x_t, const 
 }
 
 PetscErrorCode Assembly::jacobian(Part part, PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[],
-                                  Mat A)
+                                  Mat A, FixedStress *schur)
 {
   PetscFunctionBeginUser;
   PetscCall(map_matrix(A));
@@ -307,6 +307,9 @@ PetscErrorCode Assembly::jacobian(Part part, PetscReal t, Vec x, Vec x_t, PetscR
     for (PetscInt pair = 0; pair < n_fields_ * n_fields_; ++pair)
       PetscCall(compat::integrate_jacobian(PetscFEIntegrateJacobian, ds_, {nullptr, 0, pair, 0}, n, geom, u, u_t, t,
                                            shift, matrices));
+    const auto begin = static_cast<PetscInt>((geom->detJ - detJ_.data()));
+    for (PetscInt i = 0; schur && i < n; ++i)
+      PetscCall(schur->add(begin + i, matrices + i * element_size_ * element_size_, row_scale));
     PetscFunctionReturn(PETSC_SUCCESS);
   };
   const auto on_facets = [&](const Facets &facets, PetscInt n, PetscFEGeom *geom, const PetscScalar *u,

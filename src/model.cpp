@@ -28,6 +28,7 @@ PetscErrorCode Model::build(Composition composition, PetscReal modulus)
   PetscCall(create_fields());
   PetscCall(create_weak_form());
   PetscCall(create_section());
+  PetscCall(attach_rigid_body_modes(dm_));
   PetscDS rate_ds = nullptr;
   if (!own_) {
     PetscCall(create_stock());
@@ -557,6 +558,15 @@ PetscErrorCode Model::residual(PetscReal t, Vec x, Vec x_t, Vec F)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode Model::use_fixed_stress()
+{
+  PetscFunctionBeginUser;
+  PulmoUserCheck(own_, PetscObjectComm((PetscObject)(DM)dm_),
+                 "-pc_fieldsplit_schur_precondition user needs pulmo's own integration; leave -petscfe_type out");
+  PetscCall(fixed_stress_.setup(dm_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 /// PETSc's own loop over cells, then the scaling of the rows.
 PetscErrorCode Model::stock_residual(PetscReal t, Vec x, Vec x_t, Vec F)
 {
@@ -582,8 +592,16 @@ PetscErrorCode Model::jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, Mat
 {
   PetscFunctionBeginUser;
   if (!own_) PetscCall(stock_jacobian(t, x, x_t, shift, A));
-  PetscCall(
-      assembly_.jacobian(own_ ? Assembly::Part::all : Assembly::Part::facets, t, x, x_t, shift, row_scale_.data(), A));
+  FixedStress *const schur = fixed_stress_.in_use() ? &fixed_stress_ : nullptr;
+  if (schur) PetscCall(schur->begin());
+  PetscCall(assembly_.jacobian(own_ ? Assembly::Part::all : Assembly::Part::facets, t, x, x_t, shift, row_scale_.data(),
+                               A, schur));
+  if (schur) {
+    std::vector<PetscInt> closed;
+    if (airway_held_)
+      for (const AirwayNode &node : airway_) closed.push_back(node.point);
+    PetscCall(schur->end(closed));
+  }
   if (closes_rows_ && airway_held_)
     PetscCall(MatZeroRowsColumns(A, (PetscInt)closed_rows_.size(), closed_rows_.data(), 1, nullptr, nullptr));
   PetscFunctionReturn(PETSC_SUCCESS);

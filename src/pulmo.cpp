@@ -65,6 +65,7 @@ PetscErrorCode initialize()
   PetscCall(PetscPushErrorHandler(handle_error, nullptr));
   PetscCall(register_fe_type());
   PetscCall(register_metis_partitioner());
+  PetscCall(register_p_multigrid());
   PetscCall(register_step_control());
   PetscFunctionReturn(PETSC_SUCCESS);
 }

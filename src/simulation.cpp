@@ -228,6 +228,7 @@ PetscErrorCode Simulation::create_solver()
   }
   PetscCall(SNESSetComputeInitialGuess(snes, initial_guess, this));
   PetscCall(TSSetFromOptions(ts_));
+  PetscCall(offer_fixed_stress(ksp));
   if (scene_.facts().ventilator && scene_.facts().ventilator->prescribes_flow())
     PetscCall(SNESSetConvergenceTest(snes, newton_converged, this, nullptr));
   if (scene_.facts().common_pressure()) {
@@ -255,6 +256,25 @@ PetscErrorCode Simulation::create_solver()
   PetscCall(PetscObjectTypeCompare((PetscObject)(TS)ts_, TSBEULER, &is_beuler));
   PulmoUserCheck(is_beuler, comm,
                  "-ts_type: the conservative rate of porosity is exact for backward Euler only; use -ts_type beuler");
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Gives `-pc_fieldsplit_schur_precondition user` its matrix.
+PetscErrorCode Simulation::offer_fixed_stress(KSP ksp)
+{
+  PC pc;
+  PetscBool fieldsplit;
+  PCFieldSplitSchurPreType type;
+  Mat none;
+
+  PetscFunctionBeginUser;
+  PetscCall(KSPGetPC(ksp, &pc));
+  PetscCall(PetscObjectTypeCompare((PetscObject)pc, PCFIELDSPLIT, &fieldsplit));
+  if (!fieldsplit || !scene_.facts().airflow) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(PCFieldSplitGetSchurPre(pc, &type, &none));
+  if (type != PC_FIELDSPLIT_SCHUR_PRE_USER) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(model_.use_fixed_stress());
+  PetscCall(PCFieldSplitSetSchurPre(pc, type, model_.fixed_stress()));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -5,6 +5,7 @@
 
 #include "pulmo/integration.hpp"
 #include "pulmo/kinematics.hpp"
+#include "pulmo/preconditioning.hpp"
 
 #include <cstdint>
 #include <vector>
@@ -43,7 +44,9 @@ public:
   /// Adds the residual of the local vectors @p x and @p x_t to F; rows of field f are multiplied by row_scale[f].
   PetscErrorCode residual(Part part, PetscReal t, Vec x, Vec x_t, const PetscReal row_scale[], Vec F);
   /// A = dF/dx + shift dF/dx_t, rows scaled alike; Part::facets adds to A.
-  PetscErrorCode jacobian(Part part, PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[], Mat A);
+  /// With @p schur the element matrices of the cells go there too.
+  PetscErrorCode jacobian(Part part, PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[], Mat A,
+                          FixedStress *schur = nullptr);
   /// J and its integral for the local vector @p x.
   PetscErrorCode measure(Vec x, Measures &measures) const;
   /// int cof F(x) : Grad y, the derivative of int (J - 1) in direction @p y, mm^3.

@@ -84,6 +84,7 @@ public:
 
 private:
   PetscErrorCode create_solver();
+  PetscErrorCode offer_fixed_stress(KSP ksp);
   /// Whether two times of this run are the same up to rounding.
   bool same(PetscReal t, PetscReal other) const;
   /// Step size from time @p t, shortened to land on the end of the ramp or of the phase.

@@ -1,0 +1,431 @@
+#include "pulmo/preconditioning.hpp"
+
+#include "pulmo/point.hpp"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <petsc/private/pcimpl.h>
+
+namespace pulmo {
+
+namespace {
+
+/// Coordinates of a vertex, or of the middle of an edge.
+class NodeCoordinates {
+public:
+  PetscErrorCode open(DM dm)
+  {
+    PetscFunctionBeginUser;
+    dm_ = dm;
+    PetscCall(DMGetCoordinatesLocal(dm, &coordinates_));
+    PetscCall(DMGetCoordinateSection(dm, &section_));
+    PetscCall(DMPlexGetDepthStratum(dm, 0, &vertex_begin_, &vertex_end_));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+  PetscErrorCode of(PetscInt point, PetscReal x[3]) const
+  {
+    const PetscInt *ends = &point;
+    PetscInt n = 1, offset;
+
+    PetscFunctionBeginUser;
+    if (point < vertex_begin_ || point >= vertex_end_) {
+      PetscCall(DMPlexGetCone(dm_, point, &ends));
+      PetscCall(DMPlexGetConeSize(dm_, point, &n));
+    }
+    const ReadArray xs(coordinates_);
+    x[0] = x[1] = x[2] = 0;
+    for (PetscInt e = 0; e < n; ++e) {
+      PetscCall(PetscSectionGetOffset(section_, ends[e], &offset));
+      for (PetscInt d = 0; d < 3; ++d) x[d] += xs[offset + d] / n;
+    }
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+private:
+  DM dm_ = nullptr;
+  Vec coordinates_ = nullptr;
+  PetscSection section_ = nullptr;
+  PetscInt vertex_begin_ = 0, vertex_end_ = 0;
+};
+
+/// Global number of each free dof of field @p f at a point, -1 for a constrained one. Also for ghosts.
+PetscErrorCode free_dofs(PetscSection section, PetscSection global, PetscInt point, PetscInt f, PetscInt dofs[3],
+                         PetscInt &n, bool &owned)
+{
+  PetscInt offset, field_offset, first, constrained;
+  const PetscInt *which = nullptr;
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscSectionGetFieldDof(section, point, f, &n));
+  if (n == 0) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(PetscSectionGetOffset(section, point, &offset));
+  PetscCall(PetscSectionGetFieldOffset(section, point, f, &field_offset));
+  PetscCall(PetscSectionGetOffset(global, point, &first));
+  owned = first >= 0;
+  if (!owned) first = -(first + 1);
+  PetscCall(PetscSectionGetConstraintDof(section, point, &constrained));
+  if (constrained) PetscCall(PetscSectionGetConstraintIndices(section, point, &which));
+  for (PetscInt d = 0; d < n; ++d) {
+    const PetscInt local = field_offset - offset + d; // among the dofs of the point
+    const auto before = std::count_if(which, which + constrained, [&](PetscInt c) { return c < local; });
+    const bool held = std::find(which, which + constrained, local) != which + constrained;
+    dofs[d] = held ? -1 : first + local - static_cast<PetscInt>(before);
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Three translations and three rotations as vectors of the layout @p section, @p global.
+PetscErrorCode rigid_body_modes(DM dm, PetscSection section, PetscSection global, PetscInt f, MatNullSpace *modes)
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)dm);
+  NodeCoordinates nodes;
+  PetscInt begin, end, size;
+  Vec v[6];
+
+  PetscFunctionBeginUser;
+  PetscCall(nodes.open(dm));
+  PetscCall(PetscSectionGetConstrainedStorageSize(global, &size));
+  for (Vec &mode : v) PetscCall(VecCreateMPI(comm, size, PETSC_DETERMINE, &mode));
+  PetscCall(PetscSectionGetChart(section, &begin, &end));
+  for (PetscInt p = begin; p < end; ++p) {
+    PetscInt dofs[3], n;
+    PetscReal x[3];
+    bool owned = false;
+    PetscCall(free_dofs(section, global, p, f, dofs, n, owned));
+    if (n != 3 || !owned) continue;
+    PetscCall(nodes.of(p, x));
+    for (PetscInt d = 0; d < 3; ++d) {
+      const PetscInt next = (d + 1) % 3, last = (d + 2) % 3; // rotation about axis k moves along k+1 by -x[k+2], ...
+      if (dofs[d] < 0) continue;
+      PetscCall(VecSetValue(v[d], dofs[d], 1, INSERT_VALUES));
+      PetscCall(VecSetValue(v[3 + last], dofs[d], -x[next], INSERT_VALUES));
+      PetscCall(VecSetValue(v[3 + next], dofs[d], x[last], INSERT_VALUES));
+    }
+  }
+  for (Vec mode : v) {
+    PetscCall(VecAssemblyBegin(mode));
+    PetscCall(VecAssemblyEnd(mode));
+  }
+  // orthonormal, as MatNullSpace wants them
+  for (int i = 0; i < 6; ++i) {
+    for (int j = 0; j < i; ++j) {
+      PetscScalar dot;
+      PetscCall(VecDot(v[i], v[j], &dot));
+      PetscCall(VecAXPY(v[i], -dot, v[j]));
+    }
+    PetscCall(VecNormalize(v[i], nullptr));
+  }
+  PetscCall(MatNullSpaceCreate(comm, PETSC_FALSE, 6, v, modes));
+  for (Vec &mode : v) PetscCall(VecDestroy(&mode));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode make_modes(DM dm, PetscInt, PetscInt field, MatNullSpace *modes)
+{
+  PetscSection section, global;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMGetLocalSection(dm, &section));
+  PetscCall(DMGetGlobalSection(dm, &global));
+  PetscCall(rigid_body_modes(dm, section, global, field, modes));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+// ------------------------------------------------------------------------------------------------- p-multigrid
+
+struct PMultigrid {
+  PC mg = nullptr;
+  Mat interpolation = nullptr, coarse = nullptr;
+};
+
+/// The interpolation from P1 to the P2 displacement of @p dm, and the rigid-body modes of P1.
+PetscErrorCode make_interpolation(DM dm, PetscInt block_size, Mat *P, MatNullSpace *modes)
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)dm);
+  PetscSection fine, fine_global;
+  SectionHandle coarse, coarse_global;
+  PetscSF sf;
+  PetscInt begin, end, vertex_begin, vertex_end, rows, columns;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMGetLocalSection(dm, &fine));
+  PetscCall(DMGetGlobalSection(dm, &fine_global));
+  PetscCall(PetscSectionGetChart(fine, &begin, &end));
+  PetscCall(DMPlexGetDepthStratum(dm, 0, &vertex_begin, &vertex_end));
+  PetscCall(PetscSectionCreate(comm, coarse.out()));
+  PetscCall(PetscSectionSetNumFields(coarse, 1));
+  PetscCall(PetscSectionSetFieldComponents(coarse, 0, 3));
+  PetscCall(PetscSectionSetChart(coarse, begin, end));
+  for (PetscInt p = vertex_begin; p < vertex_end; ++p) {
+    PetscInt n;
+    PetscCall(PetscSectionSetDof(coarse, p, 3));
+    PetscCall(PetscSectionSetFieldDof(coarse, p, 0, 3));
+    PetscCall(PetscSectionGetFieldConstraintDof(fine, p, displacement, &n));
+    PetscCall(PetscSectionSetConstraintDof(coarse, p, n));
+    PetscCall(PetscSectionSetFieldConstraintDof(coarse, p, 0, n));
+  }
+  PetscCall(PetscSectionSetUp(coarse));
+  for (PetscInt p = vertex_begin; p < vertex_end; ++p) {
+    PetscInt n;
+    const PetscInt *which;
+    PetscCall(PetscSectionGetFieldConstraintDof(fine, p, displacement, &n));
+    if (n == 0) continue;
+    PetscCall(PetscSectionGetFieldConstraintIndices(fine, p, displacement, &which));
+    PetscCall(PetscSectionSetConstraintIndices(coarse, p, which));
+    PetscCall(PetscSectionSetFieldConstraintIndices(coarse, p, 0, which));
+  }
+  PetscCall(DMGetPointSF(dm, &sf));
+  PetscCall(PetscSectionCreateGlobalSection(coarse, sf, PETSC_FALSE, PETSC_FALSE, coarse_global.out()));
+  PetscCall(PetscSectionGetConstrainedStorageSize(fine_global, &rows));
+  PetscCall(PetscSectionGetConstrainedStorageSize(coarse_global, &columns));
+
+  PetscCall(MatCreate(comm, P));
+  PetscCall(MatSetSizes(*P, rows, columns, PETSC_DETERMINE, PETSC_DETERMINE));
+  if (block_size == 3) PetscCall(MatSetBlockSizes(*P, 3, 3)); // no node is held in part
+  PetscCall(MatSetType(*P, MATAIJ));
+  PetscCall(MatSeqAIJSetPreallocation(*P, 2, nullptr));
+  PetscCall(MatMPIAIJSetPreallocation(*P, 2, nullptr, 2, nullptr));
+  for (PetscInt p = begin; p < end; ++p) {
+    PetscInt row[3], n;
+    bool owned = false;
+    PetscCall(free_dofs(fine, fine_global, p, displacement, row, n, owned));
+    if (n != 3 || !owned) continue;
+    const PetscInt *ends = &p;
+    PetscInt n_ends = 1;
+    if (p < vertex_begin || p >= vertex_end) {
+      PetscCall(DMPlexGetCone(dm, p, &ends));
+      PetscCall(DMPlexGetConeSize(dm, p, &n_ends));
+      PetscCheck(n_ends == 2, comm, PETSC_ERR_SUP, "p_multigrid is for P2 displacement on tetrahedra");
+    }
+    for (PetscInt e = 0; e < n_ends; ++e) {
+      PetscInt column[3];
+      bool unused;
+      PetscCall(free_dofs(coarse, coarse_global, ends[e], 0, column, n, unused));
+      for (PetscInt d = 0; d < 3; ++d)
+        if (row[d] >= 0 && column[d] >= 0) PetscCall(MatSetValue(*P, row[d], column[d], 1. / n_ends, INSERT_VALUES));
+    }
+  }
+  PetscCall(MatAssemblyBegin(*P, MAT_FINAL_ASSEMBLY));
+  PetscCall(MatAssemblyEnd(*P, MAT_FINAL_ASSEMBLY));
+  PetscCall(rigid_body_modes(dm, coarse, coarse_global, 0, modes));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode setup_p_multigrid(PC pc)
+{
+  auto *self = static_cast<PMultigrid *>(pc->data);
+  const MPI_Comm comm = PetscObjectComm((PetscObject)pc);
+  Mat A, B;
+  KSP coarse, smoother;
+
+  PetscFunctionBeginUser;
+  PetscCall(PCGetOperators(pc, &A, &B));
+  if (!self->mg) {
+    DM dm;
+    PetscInt n_fields = 0, rows, fine_rows, block_size;
+    PetscSection global = nullptr;
+    const char *prefix;
+    MatNullSpace modes;
+    PetscCall(PCGetDM(pc, &dm));
+    if (dm) {
+      PetscCall(DMGetNumFields(dm, &n_fields));
+      PetscCall(DMGetGlobalSection(dm, &global));
+    }
+    PulmoUserCheck(n_fields == 1, comm,
+                   "-pc_type p_multigrid preconditions the displacement: give it to -fieldsplit_displacement_pc_type");
+    PetscCall(MatGetLocalSize(B, &rows, nullptr));
+    PetscCall(PetscSectionGetConstrainedStorageSize(global, &fine_rows));
+    PetscCheck(rows == fine_rows, comm, PETSC_ERR_ARG_SIZ, "p_multigrid: the matrix is not that of the displacement");
+    PetscCall(MatGetBlockSize(B, &block_size));
+    PetscCall(make_interpolation(dm, block_size, &self->interpolation, &modes));
+    PetscCall(MatPtAP(B, self->interpolation, MAT_INITIAL_MATRIX, 1, &self->coarse));
+    PetscCall(MatSetNearNullSpace(self->coarse, modes));
+    PetscCall(MatNullSpaceDestroy(&modes));
+    PetscCall(PCCreate(comm, &self->mg));
+    PetscCall(PetscObjectIncrementTabLevel((PetscObject)self->mg, (PetscObject)pc, 1));
+    PetscCall(PCSetType(self->mg, PCMG));
+    PetscCall(PCGetOptionsPrefix(pc, &prefix));
+    PetscCall(PCSetOptionsPrefix(self->mg, prefix));
+    PetscCall(PCAppendOptionsPrefix(self->mg, "p"));
+    PetscCall(PCMGSetLevels(self->mg, 2, nullptr));
+    PetscCall(PCMGSetInterpolation(self->mg, 1, self->interpolation));
+    PetscCall(PCSetFromOptions(self->mg));
+  } else {
+    PetscCall(MatPtAP(B, self->interpolation, MAT_REUSE_MATRIX, 1, &self->coarse));
+  }
+  PetscCall(PCMGGetCoarseSolve(self->mg, &coarse));
+  PetscCall(KSPSetOperators(coarse, self->coarse, self->coarse));
+  PetscCall(PCMGGetSmoother(self->mg, 1, &smoother));
+  PetscCall(KSPSetOperators(smoother, A, B));
+  PetscCall(PCSetOperators(self->mg, A, B));
+  PetscCall(PCSetUp(self->mg));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode apply_p_multigrid(PC pc, Vec x, Vec y)
+{
+  PetscFunctionBeginUser;
+  PetscCall(PCApply(static_cast<PMultigrid *>(pc->data)->mg, x, y));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode reset_p_multigrid(PC pc)
+{
+  auto *self = static_cast<PMultigrid *>(pc->data);
+
+  PetscFunctionBeginUser;
+  PetscCall(PCDestroy(&self->mg));
+  PetscCall(MatDestroy(&self->interpolation));
+  PetscCall(MatDestroy(&self->coarse));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode destroy_p_multigrid(PC pc)
+{
+  PetscFunctionBeginUser;
+  PetscCall(reset_p_multigrid(pc));
+  delete static_cast<PMultigrid *>(pc->data);
+  pc->data = nullptr;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode view_p_multigrid(PC pc, PetscViewer viewer)
+{
+  PetscFunctionBeginUser;
+  PetscCall(PetscViewerASCIIPrintf(viewer, "  P2 displacement above P1\n"));
+  if (auto *mg = static_cast<PMultigrid *>(pc->data)->mg) PetscCall(PCView(mg, viewer));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode create_p_multigrid(PC pc)
+{
+  PetscFunctionBeginUser;
+  pc->data = new PMultigrid;
+  pc->ops->setup = setup_p_multigrid;
+  pc->ops->apply = apply_p_multigrid;
+  pc->ops->reset = reset_p_multigrid;
+  pc->ops->destroy = destroy_p_multigrid;
+  pc->ops->view = view_p_multigrid;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace
+
+PetscErrorCode register_p_multigrid()
+{
+  PetscFunctionBeginUser;
+  PetscCall(PCRegister("p_multigrid", create_p_multigrid));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode attach_rigid_body_modes(DM dm)
+{
+  PetscFunctionBeginUser;
+  PetscCall(DMSetNearNullSpaceConstructor(dm, displacement, make_modes));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+// ------------------------------------------------------------------------------------------------ fixed stress
+
+PetscErrorCode FixedStress::setup(DM dm)
+{
+  const PetscInt field = pressure;
+  NodeCoordinates coordinates;
+  PetscSection section, global;
+  DMHandle sub;
+  ISHandle is;
+  PetscInt begin, end, cell_begin, cell_end;
+
+  PetscFunctionBeginUser;
+  dm_ = dm;
+  PetscCall(DMCreateSubDM(dm, 1, &field, is.out(), sub.out()));
+  PetscCall(DMCreateMatrix(sub, matrix_.out()));
+  PetscCall(DMGetLocalSection(sub, &section));
+  PetscCall(DMGetGlobalSection(sub, &global));
+  PetscCall(PetscSectionGetChart(section, &begin, &end));
+  point_row_.assign(end, -1);
+  std::vector<PetscInt> row(end, -1);
+  for (PetscInt p = begin; p < end; ++p) {
+    PetscInt dofs[3] = {-1, -1, -1}, n;
+    bool owned = false;
+    PetscCall(free_dofs(section, global, p, 0, dofs, n, owned));
+    if (n == 0) continue;
+    row[p] = dofs[0];
+    if (owned) point_row_[p] = dofs[0];
+  }
+  PetscCall(coordinates.open(dm));
+  PetscCall(DMGetLocalSection(dm, &section));
+  PetscCall(DMPlexGetHeightStratum(dm, 0, &cell_begin, &cell_end));
+  for (PetscInt c = cell_begin; c < cell_end; ++c) {
+    PetscInt *closure = nullptr, n_closure;
+    std::vector<std::array<PetscReal, 3>> x;
+    PetscReal middle[3] = {0, 0, 0};
+    PetscCall(DMPlexGetTransitiveClosure(dm, c, PETSC_TRUE, &n_closure, &closure));
+    for (PetscInt i = 0; i < n_closure; ++i) {
+      PetscInt dof;
+      PetscCall(PetscSectionGetFieldDof(section, closure[2 * i], displacement, &dof));
+      if (dof != 3) continue;
+      x.emplace_back();
+      PetscCall(coordinates.of(closure[2 * i], x.back().data()));
+    }
+    for (PetscInt i = n_closure - vertices_; i < n_closure; ++i) rows_.push_back(row[closure[2 * i]]); // come last
+    PetscCall(DMPlexRestoreTransitiveClosure(dm, c, PETSC_TRUE, &n_closure, &closure));
+    for (const auto &node : x)
+      for (int d = 0; d < 3; ++d) middle[d] += node[d] / static_cast<PetscReal>(x.size());
+    nodes_ = static_cast<PetscInt>(x.size());
+    for (const auto &node : x)
+      for (int d = 0; d < 3; ++d) position_.push_back(node[d] - middle[d]);
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode FixedStress::begin()
+{
+  PetscFunctionBeginUser;
+  PetscCall(MatZeroEntries(matrix_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode FixedStress::add(PetscInt c, const PetscScalar *matrix, const PetscReal row_scale[])
+{
+  const PetscInt nu = 3 * nodes_, size = nu + vertices_;
+  const PetscReal *w = &position_[c * nu];
+  PetscScalar stiffness = 0, storage = 0, load = 0, S[16];
+
+  PetscFunctionBeginHot;
+  for (PetscInt i = 0; i < size; ++i) {
+    const PetscScalar *row = matrix + i * size;
+    PetscScalar along = 0; // of this row in direction w
+    for (PetscInt j = 0; j < nu; ++j) along += row[j] * w[j];
+    if (i >= nu) {
+      storage += along * row_scale[pressure];
+    } else {
+      stiffness += w[i] * along * row_scale[displacement];
+      for (PetscInt j = nu; j < size; ++j) load += w[i] * row[j] * row_scale[displacement];
+    }
+  }
+  // S - A_pp is positive where the tissue stands a dilation; elsewhere (softening) nothing is added
+  const PetscScalar c_e = stiffness > 0 ? -storage * load / stiffness : 0;
+  for (PetscInt a = 0; a < vertices_; ++a)
+    for (PetscInt b = 0; b < vertices_; ++b)
+      S[vertices_ * a + b] =
+          row_scale[pressure] * matrix[(nu + a) * size + nu + b] + (c_e > 0 ? c_e * (a == b ? 2 : 1) / 20 : 0);
+  PetscCall(MatSetValues(matrix_, vertices_, &rows_[vertices_ * c], vertices_, &rows_[vertices_ * c], S, ADD_VALUES));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode FixedStress::end(const std::vector<PetscInt> &closed)
+{
+  std::vector<PetscInt> rows;
+
+  PetscFunctionBeginUser;
+  for (const PetscInt p : closed)
+    if (point_row_[p] >= 0) rows.push_back(point_row_[p]);
+  PetscCall(MatAssemblyBegin(matrix_, MAT_FINAL_ASSEMBLY));
+  PetscCall(MatAssemblyEnd(matrix_, MAT_FINAL_ASSEMBLY));
+  PetscCall(MatZeroRowsColumns(matrix_, (PetscInt)rows.size(), rows.data(), 1, nullptr, nullptr));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace pulmo

@@ -1,0 +1,56 @@
+#!/usr/bin/python3
+"""Every file in petsc_options/solvers gives the same waveform, with and without airflow, under pressure and under flow;
+Krylov counts of iterative.opts stay low whatever the permeability and the step.
+"""
+import glob
+import os
+import unittest
+
+import numpy as np
+
+import pulmo_case as pc
+
+SPRINGS = ["-chest_wall", "-tissue", "yoshihara"]
+PCV = ["-ventilator", "pcv", "-ventilator_inspiration", "0.2", "-ventilator_expiration", "0.1"]
+VCV = ["-ventilator", "vcv", "-ventilator_tidal_volume", "40", "-ventilator_inspiration", "0.2", "-ventilator_pause", "0.1",
+       "-ventilator_expiration", "0.1"]
+SCENES = {
+    "pcv": SPRINGS + ["-airflow"] + PCV,
+    "vcv": SPRINGS + ["-airflow"] + VCV,
+    "vcv, common pressure": SPRINGS + ["-airflow"] + VCV + ["-ventilator_flow_split", "common_pressure"],
+    "pcv without airflow": SPRINGS + PCV,
+    "vcv without airflow": SPRINGS + VCV,
+    "pcv on pins": ["-tissue", "yoshihara", "-support", "-support_rigid", "-airflow"] + PCV,
+}
+
+
+def run(solver, options, ranks=1):
+    return pc.finished(pc.options_file(f"solvers/{solver}") + pc.LUNG + options, ranks=ranks)
+
+
+class Solvers(unittest.TestCase):
+    def test_same_waveforms(self):
+        files = sorted(os.path.basename(f) for f in glob.glob(os.path.join(pc.SOURCE, "petsc_options/solvers/*.opts")))
+        self.assertGreaterEqual(len(files), 3)
+        for name, options in SCENES.items():
+            reference = run("tight.opts", options).signals()
+            for file in files:
+                with self.subTest(scene=name, solver=file):
+                    signals = run(file, options).signals()
+                    for column in ("airway_pressure_cmH2O", "volume_ml"):
+                        error = np.abs(signals[column] - reference[column]).max()
+                        self.assertLess(error, 1e-6 * np.abs(reference[column]).max(), column)
+
+    def test_iterations_stay_low(self):
+        for ranks, k, dt in [(1, "1e4", "1e-3"), (1, "1e4", "0.2"), (2, "1e4", "0.05"), (1, "1e2", "0.05"), (1, "1", "0.05"),
+                             (1, "1e-4", "0.05"), (1, "1e-4", "1e-3")]:
+            with self.subTest(ranks=ranks, permeability=k, dt=dt):
+                case = run("iterative.opts", SPRINGS + ["-airflow", "-airflow_permeability", k, "-ventilator", "pcv", "-ts_dt", dt,
+                                            "-ts_max_time", str(2 * float(dt))], ranks)
+                numbers = case.json()
+                self.assertGreater(numbers["newton_iterations"], 0)
+                self.assertLessEqual(numbers["krylov_iterations"], 15 * numbers["newton_iterations"])
+
+
+if __name__ == "__main__":
+    pc.main()
