@@ -202,7 +202,7 @@ PetscErrorCode Simulation::create_solver()
   PetscCall(TSSetDM(ts_, model_.dm()));
   PetscCall(TSSetApplicationContext(ts_, this));
   PetscCall(TSSetIFunction(ts_, nullptr, ifunction, this));
-  PetscCall(DMCreateMatrix(model_.dm(), matrix_.out()));
+  PetscCall(model_.create_matrix(matrix_.out()));
   PetscCall(TSSetIJacobian(ts_, matrix_, matrix_, ijacobian, this));
   PetscCall(TSSetProblemType(ts_, TS_NONLINEAR));
   PetscCall(TSSetType(ts_, TSBEULER));
