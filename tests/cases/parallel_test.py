@@ -65,14 +65,13 @@ class Parallel(unittest.TestCase):
         self.expect_scenes_same(breath, [(2, []), (3, [])], SCENES)
 
     # phases of flow, a pause and expiration; the cube holds 1 ml
-    LUNG_ALONE = ["-tissue", "birzle", "-airflow", "-airflow_permeability", "1e4", "-chest_wall"]
     BREATH = ["-ventilator_inspiration", "0.1", "-ventilator_pause", "0.05", "-ventilator_expiration", "0.05"]
     VCV = ["-ventilator", "vcv", "-ventilator_tidal_volume", "0.2"]
 
     def test_flow_phases(self):
         for name in VENTILATORS:
             vcv = [] if name == "tube on pressure control" else self.VCV
-            self.expect_scenes_same(pulmo.TIGHT + self.LUNG_ALONE + pulmo.CUBE + self.BREATH + vcv, [(2, []), (3, [])],
+            self.expect_scenes_same(pulmo.TIGHT + pulmo.SCENE + pulmo.CUBE + self.BREATH + vcv, [(2, []), (3, [])],
                                     [name])
 
     def test_flow_phases_of_the_stock_integrator(self):
@@ -80,7 +79,7 @@ class Parallel(unittest.TestCase):
                             ("tube on pressure control", 1)):
             with self.subTest(scene=name, ranks=ranks):
                 vcv = [] if name == "tube on pressure control" else self.VCV
-                breath = pulmo.TIGHT + self.LUNG_ALONE + pulmo.CUBE + self.BREATH + vcv + VENTILATORS[name]
+                breath = pulmo.TIGHT + pulmo.SCENE + pulmo.CUBE + self.BREATH + vcv + VENTILATORS[name]
                 own = pulmo.finished(breath)
                 stock = pulmo.finished(breath + ["-petscfe_type", "basic"], ranks=ranks)
                 self.assertEqual(stock.json()["integration"], "basic")
