@@ -68,7 +68,7 @@ class Tube(unittest.TestCase):
                     V = brentq(lambda v: self.drop((v - V) / dt) + pulmo.gas_pressure(law, 1 + v / 1000) - asked[i],
                                -100, 4000, xtol=1e-12, rtol=1e-14)
                     worst = max(worst, abs(V - rows["volume_ml"][i]))
-                self.assertLess(worst, 1e-6 * rows["volume_ml"].max())
+                self.assertLess(worst, 1e-10 * rows["volume_ml"].max())
                 self.assertLess(rows["flow_ml_per_s"].min(), -100, "both directions of flow are tried")
                 self.expect_drop(rows)
 
@@ -90,7 +90,7 @@ class Tube(unittest.TestCase):
                 self.assertLess(case.json()["mass_balance_error_ml"], 1e-7)
 
     def test_a_linear_tube_adds_its_resistance(self):
-        """R of the single-compartment fit (eq. 52) with the machine's pressure rises by K1, within 3 %. Pressure goes
+        """R of the single-compartment fit (eq. 52) with the machine's pressure rises by K1, within 2 %. Pressure goes
         up and down slowly: in a jump the lung's own R, that of a diffusing field, depends on how steep the flow is."""
         def resistance(options, pressure):
             r = pulmo.finished(pulmo.DIRECT + pulmo.SCENE + pulmo.LITRE + pulmo.QUIET + [
@@ -103,7 +103,7 @@ class Tube(unittest.TestCase):
         bare = resistance([], "airway_pressure_cmH2O")
         K1 = 5.0
         tubed = resistance(["-tube", "-tube_k1", K1], "ventilator_pressure_cmH2O")
-        self.assertAlmostEqual((tubed - bare) / K1, 1, delta=0.03, msg=f"R {bare} -> {tubed}")
+        self.assertAlmostEqual((tubed - bare) / K1, 1, delta=0.02, msg=f"R {bare} -> {tubed}")
 
 
 def bodies(*names):

@@ -69,11 +69,10 @@ class Delivery(unittest.TestCase):
                 self.assertGreater(np.ptp(rows["airway_pressure_cmH2O"]), 3)
 
     def test_direct(self):
-        """Newton to 1e-8: volumes that are prescribed are met all the same; in pressure phases the flow, which is
-        the consistent flux, and the volume agree to what Newton leaves."""
+        """Newton to 1e-8 only: volumes that are prescribed are met all the same."""
         for scene, options in (("uniform", pulmo.UNIFORM), ("common", pulmo.COMMON), ("still", pulmo.STILL)):
             with self.subTest(scene):
-                self.expect_delivered(pulmo.finished(pulmo.DIRECT + self.OPTIONS + options), 1e-8)
+                self.expect_delivered(pulmo.finished(pulmo.DIRECT + self.OPTIONS + options), 1e-9)
 
     def test_whole_lung(self):
         """The paper's VCV on the test lung: 250 ml, half of the pair's."""
@@ -109,7 +108,7 @@ class ClosedForms(unittest.TestCase):
                 V, P = rows["volume_ml"], rows["airway_pressure_cmH2O"]
                 t = rows["time_s"]
                 np.testing.assert_allclose(V, 1000 * (J - 1) * np.minimum(t, 1), rtol=0, atol=1e-9 * V[-1])
-                np.testing.assert_allclose(P[1:], pulmo.gas_pressure(law, 1 + V[1:] / 1000), rtol=1e-8)
+                np.testing.assert_allclose(P[1:], pulmo.gas_pressure(law, 1 + V[1:] / 1000), rtol=1e-11)
                 np.testing.assert_allclose([rows["min_J"], rows["max_J"]], [1 + V / 1000] * 2, rtol=1e-6)
 
     def test_beyond_the_limit_point(self):
@@ -149,7 +148,7 @@ class Supersyringe(unittest.TestCase):
         return rows["volume_ml"][ends], rows["airway_pressure_cmH2O"][ends]
 
     def test_static_curves(self):
-        """Up and down coincide, and are what the scene without airflow has, which is what PCV gives there: to 1e-6."""
+        """Up and down coincide, and are what the scene without airflow has, which is what PCV gives there: to 1e-8."""
         expected = self.VOLUME * np.array([1, 2, 3, 2, 1, 0])
         curves = {}
         for name, options in (("uniform", pulmo.UNIFORM + ["-ts_dt", "0.1"]), ("common", pulmo.COMMON + ["-ts_dt", "0.1"]),
@@ -160,10 +159,10 @@ class Supersyringe(unittest.TestCase):
             top = P.max()
             self.assertGreater(top, 4)
             for up, down in ((0, 4), (1, 3)):
-                self.assertAlmostEqual(P[up], P[down], delta=1e-6 * top, msg=name)
-            self.assertAlmostEqual(P[-1], 0, delta=1e-6 * top, msg=name)
+                self.assertAlmostEqual(P[up], P[down], delta=1e-8 * top, msg=name)
+            self.assertAlmostEqual(P[-1], 0, delta=1e-8 * top, msg=name)
         for name in ("uniform", "common"):
-            np.testing.assert_allclose(curves[name], curves["still"], rtol=0, atol=1e-6 * top, err_msg=name)
+            np.testing.assert_allclose(curves[name], curves["still"], rtol=0, atol=1e-8 * top, err_msg=name)
         pressures = pulmo.programme("".join(f"step 0.1 pressure {p:.17g}\n" for p in curves["still"][:3]))
         V = pulmo.finished(pulmo.TIGHT + pulmo.SCENE + pulmo.LITRE + pulmo.QUIET + pulmo.STILL + pressures).signals()["volume_ml"]
         volumes = [V[2 * k] for k in (1, 2, 3)]
