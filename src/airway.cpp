@@ -37,7 +37,7 @@ void Airway::begin_step(PetscReal t, PetscReal dt)
     volume_target_ = volume_begin_ + phase_.delivered(t);
   else
     target_ = phase_.value(t);
-  if (mode_ == Mode::held) pressure_ = target_;
+  pressure_ = mode_ == Mode::held ? target_ : pressure_before_; // not what a failed attempt left
 }
 
 PetscErrorCode Airway::guess(Vec X) const

@@ -202,7 +202,7 @@ PetscErrorCode Simulation::create_solver()
   PetscCall(TSSetDM(ts_, model_.dm()));
   PetscCall(TSSetApplicationContext(ts_, this));
   PetscCall(TSSetIFunction(ts_, nullptr, ifunction, this));
-  PetscCall(DMCreateMatrix(model_.dm(), matrix_.out()));
+  PetscCall(model_.create_matrix(matrix_.out()));
   PetscCall(TSSetIJacobian(ts_, matrix_, matrix_, ijacobian, this));
   PetscCall(TSSetProblemType(ts_, TS_NONLINEAR));
   PetscCall(TSSetType(ts_, TSBEULER));
@@ -508,7 +508,12 @@ PetscErrorCode Simulation::accept_stage(Vec X, PetscBool *accept)
     PetscReal pressure;
     PetscCall(airway_.pressure(local_, pressure));
     const PetscReal flow = (measures.volume_change - accepted_.volume * units::mm3_per_ml) / dt;
-    if (airway_.limit(flow)) *accept = PETSC_FALSE; // the step is taken again with the limit held
+    if (airway_.limit(flow)) { // the step is taken again, as long as it was: a shorter one would let the flow overshoot
+      TSAdapt adapt;
+      PetscCall(TSGetAdapt(ts_, &adapt));
+      PetscCall(TSSetTimeStep(ts_, dt / adapt->scale_solve_failed));
+      *accept = PETSC_FALSE;
+    }
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }

@@ -38,7 +38,11 @@ public:
   /// Whether the volume of a flow phase was met when close() was called last.
   bool satisfied() const;
   /// Takes note of an accepted step that ended at @p volume, mm^3.
-  void accept(PetscReal volume) { volume_before_ = volume; }
+  void accept(PetscReal volume)
+  {
+    volume_before_ = volume;
+    pressure_before_ = pressure_;
+  }
   /// Pressure at the airway, kPa: what is held, the unknown, or the mean over the free surface.
   PetscErrorCode pressure(Vec local, PetscReal &pressure);
   /// Pressure at the ventilator's side of the tube, kPa, at flow @p flow into the lung, mm^3/s.
@@ -60,7 +64,7 @@ private:
   const SceneFacts &facts_;
   Phase phase_;
   Mode mode_ = Mode::held;
-  PetscReal pressure_ = 0;                         ///< at the airway, kPa
+  PetscReal pressure_ = 0, pressure_before_ = 0;   ///< at the airway now, before the step, kPa
   PetscReal target_ = 0;                           ///< pressure that the phase prescribes, kPa
   PetscReal volume_begin_ = 0, volume_before_ = 0; ///< at the begin of the phase, of the step, mm^3
   PetscReal volume_target_ = 0, volume_ = 0;       ///< prescribed; at the last close(), mm^3

@@ -43,6 +43,8 @@ public:
   PetscErrorCode residual(PetscReal t, Vec x, Vec x_t, Vec F);
   /// Zeroes the rows of held nodes and of the carrier in a global residual.
   PetscErrorCode close_rows(Vec F) const;
+  /// A matrix for jacobian(), of type -dm_mat_type.
+  PetscErrorCode create_matrix(Mat *A) const;
   /// Global Jacobian dF/dx + shift dF/dx_t, rows scaled.
   PetscErrorCode jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, Mat A);
 

@@ -140,6 +140,11 @@ def table(m):
     good = with_mesh(m["good"])
     blocked = text_file("blocked", b"a file where the directory should be\n")
     missing = pulmo.scratch("nowhere.msh")
+    lung = pulmo.DIRECT + ["-dm_plex_filename", m["good"], "-airflow", "-chest_wall"]
+
+    def file_of(name, text):
+        return lung + ["-ventilator", "programme", "-ventilator_programme", text_file(name, text)]
+
     return {
         # the mesh
         "no mesh": (NO_MESH, ["-dm_plex_filename FILE"]),
@@ -217,6 +222,49 @@ def table(m):
         "a support that holds nothing": (good + ["-support"], ["-support", "-support_surfaces", "-support_rigid"]),
         "nothing holds the lung": (pulmo.DIRECT + ["-dm_plex_filename", m["good"], "-ventilator", "pcv"],
                                    ["-chest_wall", "-support_rigid"]),
+        # modes of the ventilator
+        "pip of volume control": (lung + ["-ventilator", "vcv", "-ventilator_pip", "6"],
+                                  ["-ventilator_pip", "no effect", "-ventilator pcv"]),
+        "tidal volume of pressure control": (good + ["-ventilator_tidal_volume", "500"],
+                                             ["-ventilator_tidal_volume", "no effect", "-ventilator vcv"]),
+        "steps of volume control": (lung + ["-ventilator", "vcv", "-ventilator_steps", "3"],
+                                    ["-ventilator_steps", "no effect", "-ventilator supersyringe"]),
+        "peep of the supersyringe": (lung + ["-ventilator", "supersyringe", "-ventilator_peep", "3"],
+                                     ["-ventilator_peep", "no effect", "-ventilator pcv or vcv"]),
+        "inspiration of a programme": (file_of("fine.txt", b"a 1 hold\n") + ["-ventilator_inspiration", "1"],
+                                       ["-ventilator_inspiration", "no effect"]),
+        "a split of no flow": (good + ["-ventilator_flow_split", "uniform"], ["-ventilator_flow_split", "no effect"]),
+        "unknown split": (lung + ["-ventilator", "vcv", "-ventilator_flow_split", "fair"],
+                          ["-ventilator_flow_split", "'fair'", "uniform", "common_pressure"]),
+        "no tidal volume": (lung + ["-ventilator", "vcv", "-ventilator_tidal_volume", "0"],
+                            ["-ventilator_tidal_volume", "out of range", "> 0"]),
+        "half a step": (lung + ["-ventilator", "supersyringe", "-ventilator_steps", "1.5"],
+                        ["-ventilator_steps", "whole number", "'1.5'"]),
+        "ramp of flow longer than inspiration": (lung + ["-ventilator", "vcv", "-ventilator_ramp", "1.2"],
+                                                 ["-ventilator_ramp 1.2", "-ventilator_inspiration 1", "shorten"]),
+        "file without the mode": (good + ["-ventilator_programme", text_file("idle.txt", b"a 1 hold\n")],
+                                  ["-ventilator_programme", "no effect", "-ventilator programme"]),
+        "programme without a file": (lung + ["-ventilator", "programme"], ["-ventilator_programme FILE", "docs/ventilator.md"]),
+        "missing programme": (lung + ["-ventilator", "programme", "-ventilator_programme", missing],
+                              ["-ventilator_programme", missing, "check its name"]),
+        "a folder as programme": (lung + ["-ventilator", "programme", "-ventilator_programme", m["folder"]],
+                                  ["-ventilator_programme", m["folder"], "check its name"]),
+        "empty programme": (file_of("empty.txt", b""), ["empty.txt holds no phase", "inspiration 1.0 pressure 15"]),
+        "binary programme": (file_of("junk.bin", bytes(range(256)) * 20), ["junk.bin:", "starts with the phase's name"]),
+        "a wrong line": (file_of("wrong.txt", b"settle 1 pressure 5\n# fine so far\ninspiration 1 presure 15\n"),
+                         ["wrong.txt:3:", "'presure'", "pressure, flow or hold"]),
+        "a repeat without end": (file_of("open.txt", b"a 1 hold\nrepeat 3\nb 1 hold\n"), ["open.txt:2:", "'repeat'", "'end'"]),
+        "tube without coefficients": (good + ["-tube"], ["-tube", "-tube_k1", "-tube_k2"]),
+        "negative tube": (good + ["-tube", "-tube_k1", "-2"], ["-tube_k1", "-2", "out of range"]),
+        "coefficient without tube": (good + ["-tube_k1", "2"], ["-tube_k1", "no effect", "-tube"]),
+        "tube without ventilator": (lung + ["-tube", "-tube_k1", "2"], ["-tube", "-ventilator"]),
+        "trust region with a common pressure": (
+            lung + ["-ventilator", "vcv", "-ventilator_flow_split", "common_pressure", "-snes_type", "newtontr"],
+            ["-snes_type", "newtonls"]),
+        "trust region with a tube": (good + ["-tube", "-tube_k1", "2", "-snes_type", "newtontr"],
+                                     ["-snes_type", "newtonls"]),
+        "stock loops with a volume of uniform gas": (
+            lung + ["-airflow", "off", "-ventilator", "vcv", "-petscfe_type", "basic"], ["-petscfe_type basic", "pulmo"]),
         # solver and time
         "no solver file": (pulmo.PCV + ["-dm_plex_filename", m["good"]], ["petsc_options/solvers/direct.opts", "-pc_type"]),
         "time integrator": (good + ["-ts_type", "bdf"], ["-ts_type", "beuler"]),

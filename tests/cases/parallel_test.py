@@ -21,6 +21,15 @@ SCENES = {
     "quadrature degree 4": ["-quadrature_degree", "4"],
 }
 
+VENTILATORS = {
+    "vcv, uniform": ["-ventilator_flow_split", "uniform"],
+    "vcv, common pressure": ["-ventilator_flow_split", "common_pressure"],
+    "vcv, no airflow": ["-airflow", "off"],
+    "vcv, no airflow, pins": PINS + ["-airflow", "off", "-tissue", "yoshihara"],
+    "vcv, tube, lumen pressure": ["-tube", "-tube_k1", "2", "-tube_k2", "1000", "-lumen_pressure"],
+    "tube on pressure control": ["-ventilator", "pcv", "-ventilator_pip", "5", "-tube", "-tube_k1", "2000"],
+}
+
 
 class Parallel(unittest.TestCase):
     def expect_same(self, reference, other, tolerance=1e-8):
@@ -35,7 +44,7 @@ class Parallel(unittest.TestCase):
 
     def expect_scenes_same(self, base, variants, scenes):
         for name in scenes:
-            options = base + SCENES[name]
+            options = base + {**SCENES, **VENTILATORS}[name]
             reference = pulmo.finished(options)
             self.assertEqual(reference.json()["ranks"], 1)
             self.assertEqual(reference.json()["integration"], "pulmo")
@@ -54,6 +63,27 @@ class Parallel(unittest.TestCase):
         breath = pulmo.TIGHT + pulmo.PCV + pulmo.CUBE + [
             "-ventilator_inspiration", "0.3", "-ventilator_expiration", "0.3"]
         self.expect_scenes_same(breath, [(2, []), (3, [])], SCENES)
+
+    # phases of flow, a pause and expiration; the cube holds 1 ml
+    BREATH = ["-ventilator_inspiration", "0.1", "-ventilator_pause", "0.05", "-ventilator_expiration", "0.05"]
+    VCV = ["-ventilator", "vcv", "-ventilator_tidal_volume", "0.2"]
+
+    def test_flow_phases(self):
+        for name in VENTILATORS:
+            vcv = [] if name == "tube on pressure control" else self.VCV
+            self.expect_scenes_same(pulmo.TIGHT + pulmo.SCENE + pulmo.CUBE + self.BREATH + vcv, [(2, []), (3, [])],
+                                    [name])
+
+    def test_flow_phases_of_the_stock_integrator(self):
+        for name, ranks in (("vcv, uniform", 1), ("vcv, uniform", 2), ("vcv, common pressure", 2),
+                            ("tube on pressure control", 1)):
+            with self.subTest(scene=name, ranks=ranks):
+                vcv = [] if name == "tube on pressure control" else self.VCV
+                breath = pulmo.TIGHT + pulmo.SCENE + pulmo.CUBE + self.BREATH + vcv + VENTILATORS[name]
+                own = pulmo.finished(breath)
+                stock = pulmo.finished(breath + ["-petscfe_type", "basic"], ranks=ranks)
+                self.assertEqual(stock.json()["integration"], "basic")
+                self.expect_same(own, stock)
 
     def test_cube_partitioners(self):
         short = pulmo.TIGHT + pulmo.PCV + pulmo.CUBE + ["-ts_max_time", "0.2"]

@@ -37,13 +37,52 @@ def options_file(name):
 TIGHT = options_file("solvers/tight.opts")
 DIRECT = options_file("solvers/direct.opts")
 PCV = options_file("scenes/pcv.opts")
+VCV = options_file("scenes/vcv.opts")
 CUBE = ["-dm_plex_filename", mesh("cube_lung.msh"), "-mesh_scale", "1"]
 LUNG = ["-dm_plex_filename", mesh("lung_test.msh")]
+LITRE = ["-dm_plex_filename", mesh("cube_lung.msh"), "-mesh_scale", "10"]  # a cube of 1000 ml, one face airway
+BLOCK = ["-dm_plex_filename", mesh("cube_coarse.msh"), "-mesh_scale", "100"]  # the same volume, faces x0 ... z1
+# supports that leave the block free to inflate: F = J^(1/3) I
+PINS = ["-support", "-support_rigid"]
+ROLLERS = ["-support", "-support_surfaces", "x0,y0,z0", "-support_components_x0", "x", "-support_components_y0", "y",
+           "-support_components_z0", "z"]
+SCENE = ["-tissue", "birzle", "-airflow", "-airflow_permeability", "1e4", "-chest_wall"]  # all but a ventilator
+STILL = ["-airflow", "off"]
+UNIFORM, COMMON = ["-ventilator_flow_split", "uniform"], ["-ventilator_flow_split", "common_pressure"]
+QUIET = ["-progress", "off"]
 
 
 def scratch(name=""):
     """A path that does not exist yet, in a folder that goes away with the test."""
     return os.path.join(tempfile.mkdtemp(dir=_scratch.name), name or "run")
+
+
+def programme(text):
+    path = scratch("programme.txt")
+    with open(path, "w") as f:
+        f.write(text)
+    return ["-ventilator", "programme", "-ventilator_programme", path]
+
+
+def gas_pressure(law, J):
+    """p = dW/dJ of F = J^(1/3) I, cmH2O, with the parameters of Table 1 (closed forms, not pulmo's code)."""
+    s, J3 = np.cbrt(J) ** 2, 1 / np.cbrt(J)
+    if law == "berger":
+        mu, lam, phi0 = 0.2808, 0.4212, 0.99
+        p = mu * J3 + lam / 2 * J - (mu + lam / 2) / (J - 1 + phi0)
+    elif law == "ma":
+        a, b, c = 0.43, -0.6, 2
+        g = 3 * (3 * a + b) / 4
+        p = c * np.exp(g * (s - 1) ** 2) * 2 * g * (s - 1) * 2 / 3 * J3
+    elif law == "birzle":
+        c, beta, c3 = 0.3567, 1.075, 5.766e-3
+        p = 2 * c * J3 - 2 * c * J ** (-2 * beta - 1) + 4 * c3 * (s - 1) ** 5 * J3
+    elif law == "yoshihara":
+        c, beta = 1.298, 0.75
+        p = 2 * c * J3 - 2 * c * J ** (-2 * beta - 1)
+    elif law == "rausch":
+        p = 16.5 / 2 * (J - 1 / J)
+    return p / KPA_PER_CMH2O
 
 
 class Case:

@@ -13,6 +13,8 @@ using SceneRun = pulmo::Run;
 /// A combination of effects on meshes/cube_coarse.msh (24 cells, faces x0 ... z1 of the unit cube).
 struct SceneSpec {
   bool airflow = false, lumen_pressure = false, ventilator = false, traction = false;
+  std::string mode = "pcv"; ///< of the ventilator: also vcv, vcv common_pressure
+  bool tube = false;
   std::string chest_wall; ///< full, normal or none
   std::string support;    ///< surfaces, rigid or none
   std::string law = "birzle";
@@ -23,7 +25,10 @@ struct SceneSpec {
     std::string s =
         "-dm_plex_filename " + source("meshes/cube_coarse.msh") + " -mesh_scale 1 -pc_type lu -tissue " + law;
     if (airflow) s += " -airflow -airflow_permeability 0.7 -airflow_surfaces x1";
-    if (ventilator) s += " -ventilator pcv -ventilator_pip 6";
+    if (ventilator)
+      s += mode == "pcv" ? " -ventilator pcv -ventilator_pip 6" : " -ventilator vcv -ventilator_tidal_volume 1e-3";
+    if (mode == "vcv common_pressure") s += " -ventilator_flow_split common_pressure";
+    if (tube) s += " -tube -tube_k1 3";
     if (!chest_wall.empty())
       s += " -chest_wall -chest_wall_surfaces x0,z1 -chest_wall_stiffness 0.08 -chest_wall_stiffness_z1 0.21"
            " -chest_wall_direction " +
@@ -38,7 +43,7 @@ struct SceneSpec {
   }
   std::string text() const
   {
-    return law + (airflow ? " airflow" : "") + (ventilator ? " ventilator" : "") +
+    return law + (airflow ? " airflow" : "") + (ventilator ? " ventilator:" + mode : "") + (tube ? " tube" : "") +
            (chest_wall.empty() ? "" : " chest_wall:" + chest_wall) + (lumen_pressure ? " lumen_pressure" : "") +
            (traction ? " traction" : "") + (support.empty() ? "" : " support:" + support) + " " + more;
   }
@@ -60,6 +65,26 @@ inline std::vector<SceneSpec> all_scenes()
         s.support = support;
         if (s.lumen_pressure && !s.airflow && !s.ventilator) continue;
         list.push_back(s);
+      }
+  return list;
+}
+
+/// What flow phases and a tube bring, over scenes with and without airflow, wall pressure and supports.
+inline std::vector<SceneSpec> flow_scenes()
+{
+  std::vector<SceneSpec> list;
+  for (const char *mode : {"pcv", "vcv", "vcv common_pressure"})
+    for (int bits = 0; bits < 8; ++bits)
+      for (const char *support : {"", "surfaces", "rigid"}) {
+        SceneSpec s;
+        s.ventilator = true;
+        s.mode = mode;
+        s.airflow = bits & 1;
+        s.tube = bits & 2;
+        s.lumen_pressure = bits & 4;
+        s.chest_wall = "full";
+        s.support = support;
+        if (s.mode != "pcv" || s.tube) list.push_back(s);
       }
   return list;
 }

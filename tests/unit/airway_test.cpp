@@ -1,0 +1,352 @@
+// The condition at the airway: modes, prescribed flux, the scalar equation of an unknown pressure and its Newton step.
+#include "unit/scenes.hpp"
+
+#include "pulmo/airway.hpp"
+#include "pulmo/units.hpp"
+
+namespace pulmo::test {
+namespace {
+
+using Mode = Airway::Mode;
+
+/// A scene on the coarse cube, airway at x1.
+SceneSpec breathing(const std::string &mode, bool airflow, bool tube = false)
+{
+  SceneSpec s;
+  s.ventilator = true;
+  s.mode = mode;
+  s.airflow = airflow;
+  s.tube = tube;
+  s.chest_wall = "full";
+  s.law = "yoshihara";
+  return s;
+}
+
+std::vector<SceneSpec> breathing_scenes()
+{
+  std::vector<SceneSpec> list;
+  for (const char *mode : {"pcv", "vcv", "vcv common_pressure"})
+    for (bool airflow : {false, true})
+      for (bool tube : {false, true}) list.push_back(breathing(mode, airflow, tube));
+  return list;
+}
+
+Phase flow_phase(double begin, double end, double flow)
+{
+  Phase p;
+  p.name = "inspiration";
+  p.control = Control::flow;
+  p.begin = begin;
+  p.end = end;
+  p.from = 0;
+  p.to = flow;
+  p.ramp = 0.1;
+  return p;
+}
+
+Phase pressure_phase(double begin, double end, double value, double ramp = 0)
+{
+  Phase p;
+  p.name = "expiration";
+  p.begin = begin;
+  p.end = end;
+  p.to = value;
+  p.ramp = ramp;
+  return p;
+}
+
+TEST(Airway, ModesFollowControlSplitAndTube)
+{
+  for (const SceneSpec &scene : breathing_scenes()) {
+    SCOPED_TRACE(scene.text());
+    const Registry registry = Registry::standard();
+    SceneRun run(registry);
+    PULMO_OK(prepare(run, scene.options()));
+    Airway airway(run.model(), run.scene().facts());
+    airway.begin_phase(pressure_phase(0, 1, 0.4), 0);
+    EXPECT_EQ(airway.mode(), scene.tube ? Mode::common : Mode::held);
+    if (scene.mode == "pcv") continue;
+    airway.begin_phase(flow_phase(1, 2, 300), 0);
+    EXPECT_EQ(airway.mode(), scene.airflow && scene.mode == "vcv" ? Mode::free : Mode::common);
+  }
+}
+
+TEST(Airway, FlowMakesUpForWhatEarlierStepsLeft)
+{
+  const Registry registry = Registry::standard();
+  SceneRun run(registry);
+  PULMO_OK(prepare(run, breathing("vcv", true).options()));
+  Airway airway(run.model(), run.scene().facts());
+  const Phase phase = flow_phase(1, 2, 300);
+  const double begin = 17;
+  double volume = begin, t = 1;
+  airway.begin_phase(phase, begin);
+  for (double dt : {0.05, 0.1, 0.3, 0.01, 0.54}) {
+    t += dt;
+    airway.begin_step(t, dt);
+    volume += airway.flow() * dt;
+    EXPECT_NEAR(volume, begin + phase.delivered(t), 1e-12 * 300);
+    volume += 1e-3; // the solver's error
+    airway.accept(volume);
+  }
+}
+
+TEST(Airway, TheGuessAfterAFailedAttemptIsTheLastAcceptedPressure)
+{
+  const Registry registry = Registry::standard();
+  SceneRun run(registry);
+  VecHandle X;
+  PetscReal P;
+  PULMO_OK(prepare(run, breathing("vcv common_pressure", true).options()));
+  PULMO_OK(DMCreateGlobalVector(run.model().dm(), X.out()));
+  Airway airway(run.model(), run.scene().facts());
+  airway.begin_phase(flow_phase(0, 1, 300), 0);
+  airway.begin_step(0.1, 0.1);
+  PULMO_OK(run.model().set_airway_nodes(X, 0.25));
+  PULMO_OK(airway.apply(X));
+  airway.accept(15);
+  airway.begin_step(0.2, 0.1);
+  PULMO_OK(run.model().set_airway_nodes(X, -1e30)); // where Newton went
+  PULMO_OK(airway.apply(X));
+  airway.begin_step(0.125, 0.025);
+  PULMO_OK(airway.guess(X));
+  PULMO_OK(run.model().carrier_value(X, P));
+  EXPECT_EQ(P, 0.25);
+}
+
+TEST(Airway, ALimitIsHeldOnceItIsExceeded)
+{
+  for (bool tube : {false, true})
+    for (bool airflow : {false, true}) {
+      const SceneSpec scene = breathing("vcv common_pressure", airflow, tube);
+      SCOPED_TRACE(scene.text());
+      const Registry registry = Registry::standard();
+      SceneRun run(registry);
+      VecHandle X;
+      PULMO_OK(prepare(run, scene.options()));
+      PULMO_OK(DMCreateGlobalVector(run.model().dm(), X.out()));
+      const double flow = 300, drop = tube ? 3 * units::kPa_per_cmH2O * flow / 1e6 : 0; // K1 = 3 cmH2O s/l
+      Phase phase = flow_phase(0, 1, flow);
+      phase.limit = 0.5;
+      Airway airway(run.model(), run.scene().facts());
+      airway.begin_phase(phase, 0);
+      airway.begin_step(0.1, 0.1);
+      PULMO_OK(run.model().set_airway_nodes(X, 0.5 - drop * (1 + 1e-9)));
+      PULMO_OK(airway.apply(X));
+      EXPECT_NEAR(airway.ventilator_pressure(flow), 0.5, 1e-9);
+      EXPECT_FALSE(airway.limit(flow));
+      EXPECT_EQ(airway.mode(), Mode::common);
+      PULMO_OK(run.model().set_airway_nodes(X, 0.5 - drop + 1e-6));
+      PULMO_OK(airway.apply(X));
+      EXPECT_TRUE(airway.limit(flow));
+      EXPECT_EQ(airway.mode(), tube ? Mode::common : Mode::held);
+      airway.begin_step(0.1, 0.1);
+      PetscReal pressure;
+      PULMO_OK(airway.pressure(X, pressure));
+      if (!tube) {
+        EXPECT_EQ(pressure, 0.5);
+      }
+      EXPECT_FALSE(airway.limit(1e9)) << "held already";
+    }
+}
+
+/// The scalar equation's value at airway pressure @p P and volume @p V.
+PetscErrorCode equation(SceneRun &run, Airway &airway, Vec X, Vec F, PetscReal P, PetscReal V, PetscReal &c)
+{
+  PetscFunctionBeginUser;
+  PetscCall(run.model().set_airway_nodes(X, P));
+  PetscCall(airway.apply(X));
+  PetscCall(airway.close(V, F));
+  PetscCall(run.model().carrier_value(F, c));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+TEST(Airway, NewtonStepOfTheScalarEquation)
+{
+  for (bool airflow : {false, true})
+    for (bool flow : {false, true}) {
+      SceneSpec scene = breathing("vcv common_pressure", airflow, true);
+      scene.more = "-tube_k2 4e5";
+      SCOPED_TRACE(scene.text() + (flow ? "flow" : "pressure"));
+      const Registry registry = Registry::standard();
+      SceneRun run(registry);
+      VecHandle X, F;
+      PULMO_OK(prepare(run, scene.options()));
+      PULMO_OK(DMCreateGlobalVector(run.model().dm(), X.out()));
+      PULMO_OK(VecDuplicate(X, F.out()));
+      Airway airway(run.model(), run.scene().facts());
+      airway.begin_phase(flow ? flow_phase(0, 1, 0.7) : pressure_phase(0, 1, 0.8), 0.02);
+      airway.begin_step(0.3, 0.05);
+      // expiration as well: |Q| must not lose its sign
+      for (double V : {0.09, -0.03}) {
+        const double P = 0.3, fixed = 0.011, per_P = 0.23;
+        PetscReal c, more, less, c_P, c_V;
+        PULMO_OK(equation(run, airway, X, F, P + 1e-3, V, more));
+        PULMO_OK(equation(run, airway, X, F, P - 1e-3, V, less));
+        c_P = (more - less) / 2e-3;
+        PULMO_OK(equation(run, airway, X, F, P, V + 1e-4, more));
+        PULMO_OK(equation(run, airway, X, F, P, V - 1e-4, less));
+        c_V = (more - less) / 2e-4;
+        PULMO_OK(equation(run, airway, X, F, P, V, c));
+        const double change = airway.change(c, c_P, fixed, per_P);
+        EXPECT_GT(std::abs(change), 1e-3);
+        EXPECT_NEAR(c + c_P * change + c_V * (fixed + per_P * change), 0, 1e-9 * (1 + std::abs(c)));
+        if (flow) {
+          EXPECT_EQ(c_P, 0);
+        }
+      }
+    }
+}
+
+TEST(Airway, TheWholeNewtonStepConvergesQuadratically)
+{
+  // one step from rest: a bordered step that misses a derivative would crawl to 1e-12
+  for (const SceneSpec &scene : breathing_scenes()) {
+    SCOPED_TRACE(scene.text());
+    const Registry registry = Registry::standard();
+    SceneRun run(registry);
+    bool finished = false;
+    PULMO_OK(prepare(
+        run, "-options_file " + source("petsc_options/solvers/tight.opts") + " " + scene.options() +
+                 (scene.mode == "pcv" ? " -ventilator_ramp 0 -ventilator_pip 3" : " -ventilator_tidal_volume 4e-3") +
+                 (scene.tube ? " -tube_k1 1000 -tube_k2 1e5" : "") + " -ts_max_time 0.05"));
+    PULMO_OK(run.simulation().run(finished));
+    ASSERT_TRUE(finished) << run.simulation().failure_text();
+    EXPECT_GT(run.simulation().rows().back().volume, 1e-5);
+    EXPECT_LE(run.simulation().rows().back().newton, 6);
+    EXPECT_GE(run.simulation().rows().back().newton, 2);
+  }
+}
+
+// --------------------------------------------------------------------------------------------------- model
+
+TEST(AirwayModel, MeanPressureIsTheSurfaceMean)
+{
+  SceneSpec scene = breathing("vcv", true);
+  scene.more = "-airflow_surfaces x1,z1"; // two faces of the unit cube that share an edge
+  const Registry registry = Registry::standard();
+  SceneRun run(registry);
+  VecHandle x;
+  PetscReal mean;
+  PULMO_OK(prepare(run, scene.options()));
+  PULMO_OK(DMCreateLocalVector(run.model().dm(), x.out()));
+  PULMO_OK(interpolate(
+      run, x,
+      [](const double *) {
+        return std::array<double, 3>{0, 0, 0};
+      },
+      [](const double X[3]) { return 0.2 + 3 * X[0] - 2 * X[1] + 5 * X[2]; }));
+  PULMO_OK(run.model().airway_mean_pressure(x, mean));
+  const double at_x1 = 0.2 + 3 - 1 + 2.5, at_z1 = 0.2 + 1.5 - 1 + 5; // at the middles of the faces
+  EXPECT_NEAR(mean, (at_x1 + at_z1) / 2, 1e-13);
+}
+
+TEST(AirwayModel, APrescribedFlowEntersByAreaAtTheAirwayOnly)
+{
+  const Registry registry = Registry::standard();
+  SceneRun run(registry);
+  State s;
+  VecHandle with;
+  PULMO_OK(prepare(run, breathing("vcv", true).options()));
+  PULMO_OK(random_state(run, 5, s));
+  PULMO_OK(VecDuplicate(s.residual, with.out()));
+  run.model().hold_airway(false);
+  const double flow = 0.37;
+  PULMO_OK(run.model().set_step(s.dt, 0, 0));
+  PULMO_OK(run.model().residual(s.t, s.x, s.x_t, s.residual));
+  PULMO_OK(run.model().set_step(s.dt, 0, flow));
+  PULMO_OK(run.model().residual(s.t, s.x, s.x_t, with));
+  PULMO_OK(VecAXPY(with, -1, s.residual));
+  // int Q.N q with Q.N = -flow / area: minus the flow in all; with q = y half of it, with q = 1 - x nothing
+  double total = 0, by_y = 0, away = 0, momentum = 0;
+  {
+    const ReadArray d(with);
+    PULMO_OK(for_each_dof(run, [&](PetscInt dof, PetscInt field, PetscInt, const PetscReal X[3]) {
+      const double value = d[dof] / run.model().row_scale(field);
+      if (field == displacement) {
+        momentum = std::max(momentum, std::abs(value));
+        return;
+      }
+      total += value;
+      by_y += X[1] * value;
+      away += (1 - X[0]) * std::abs(value);
+    }));
+  }
+  EXPECT_NEAR(total, -flow, 1e-12);
+  EXPECT_NEAR(by_y, -flow / 2, 1e-12);
+  EXPECT_LT(away, 1e-12);
+  EXPECT_EQ(momentum, 0);
+}
+
+TEST(AirwayModel, HeldRowsAndColumnsAreIdentity)
+{
+  for (const SceneSpec &scene : {breathing("vcv", true), breathing("vcv common_pressure", false)}) {
+    SCOPED_TRACE(scene.text());
+    const Registry registry = Registry::standard();
+    SceneRun run(registry);
+    State s;
+    MatHandle A, dense;
+    VecHandle rows, F;
+    PetscInt n;
+    PULMO_OK(prepare(run, scene.options()));
+    PULMO_OK(random_state(run, 6, s));
+    run.model().hold_airway(true);
+    PULMO_OK(run.model().create_matrix(A.out()));
+    PULMO_OK(run.model().jacobian(s.t, s.x, s.x_t, 1 / s.dt, A));
+    PULMO_OK(MatConvert(A, MATDENSE, MAT_INITIAL_MATRIX, dense.out()));
+    PULMO_OK(DMCreateGlobalVector(run.model().dm(), rows.out()));
+    PULMO_OK(VecDuplicate(rows, F.out()));
+    PULMO_OK(run.model().set_airway_nodes(rows, 1)); // 1 on the nodes of the airway and the carrier
+    PULMO_OK(VecSet(F, 3));
+    PULMO_OK(run.model().close_rows(F));
+    PULMO_OK(VecGetSize(rows, &n));
+    const ReadArray at_airway(rows), closed(F);
+    const PetscScalar *a;
+    PULMO_OK(MatDenseGetArrayRead(dense, &a));
+    PetscInt held = 0;
+    for (PetscInt i = 0; i < n; ++i) {
+      if (at_airway[i] == 0) continue;
+      ++held;
+      EXPECT_EQ(closed[i], 0);
+      for (PetscInt j = 0; j < n; ++j) {
+        EXPECT_EQ(a[j * n + i], i == j ? 1 : 0);
+        EXPECT_EQ(a[i * n + j], i == j ? 1 : 0);
+      }
+    }
+    PULMO_OK(MatDenseRestoreArrayRead(dense, &a));
+    EXPECT_EQ(held, scene.airflow ? 5 : 1); // corners and middle of the face x1; one dof of the gas
+  }
+}
+
+TEST(AirwayModel, VolumeDerivative)
+{
+  const Registry registry = Registry::standard();
+  SceneRun run(registry);
+  State s;
+  VecHandle y;
+  Random random(9);
+  PULMO_OK(prepare(run, breathing("vcv common_pressure", true).options()));
+  PULMO_OK(random_state(run, 7, s));
+  PULMO_OK(VecDuplicate(s.x, y.out()));
+  PULMO_OK(interpolate(
+      run, y,
+      [&](const double *) {
+        return std::array<double, 3>{random(), random(), random()};
+      },
+      [&](const double *) { return random(); }));
+  PetscReal exact;
+  PULMO_OK(run.model().volume_derivative(s.x, y, exact));
+  const double difference = derivative(
+      [&](double h) {
+        Measures m;
+        EXPECT_EQ(static_cast<int>(VecWAXPY(s.work, h, y, s.x)), 0);
+        EXPECT_EQ(static_cast<int>(run.model().measure(s.work, m)), 0);
+        return m.volume_change;
+      },
+      1e-4);
+  EXPECT_GT(std::abs(exact), 1e-3);
+  EXPECT_NEAR(exact, difference, 1e-10);
+}
+
+} // namespace
+} // namespace pulmo::test
