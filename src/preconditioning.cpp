@@ -321,8 +321,23 @@ PetscErrorCode register_p_multigrid()
 
 PetscErrorCode attach_rigid_body_modes(DM dm)
 {
+  const PetscInt field = displacement;
+  PetscInt n_fields;
+
   PetscFunctionBeginUser;
-  PetscCall(DMSetNearNullSpaceConstructor(dm, displacement, make_modes));
+  PetscCall(DMGetNumFields(dm, &n_fields));
+  if (n_fields == 1) {
+    PetscCall(DMSetNearNullSpaceConstructor(dm, displacement, make_modes));
+  } else { // a split takes them from the discretisation of its field
+    DMHandle sub;
+    PetscObject element;
+    MatNullSpace modes;
+    PetscCall(DMCreateSubDM(dm, 1, &field, nullptr, sub.out()));
+    PetscCall(make_modes(sub, field, 0, &modes));
+    PetscCall(DMGetField(dm, field, nullptr, &element));
+    PetscCall(PetscObjectCompose(element, "nearnullspace", (PetscObject)modes));
+    PetscCall(MatNullSpaceDestroy(&modes));
+  }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

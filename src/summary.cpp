@@ -3,6 +3,7 @@
 
 #include <nlohmann/json.hpp>
 
+#include <cmath>
 #include <filesystem>
 #include <fstream>
 
@@ -310,7 +311,8 @@ PetscErrorCode print_numbers(MPI_Comm comm, const Output &output, const Scene &s
                           scene.tissue().law().name(), (double)(scene.mesh().volume() / units::mm3_per_ml)));
     for (const Entry &e : entries(overall_numbers(rows), functional_residual_capacity(scene))) {
       if (!e.value) continue;
-      PetscCall(PetscPrintf(comm, "  %-28s %12.4g %s\n", e.label, *e.value, e.unit));
+      const double shown = std::abs(*e.value) < 1e-9 ? 0 : *e.value; // what the solver left of a zero
+      PetscCall(PetscPrintf(comm, "  %-28s %12.4g %s\n", e.label, shown, e.unit));
     }
   }
   if (audits.energy) PetscCall(print_energy(comm, *audits.energy, breath));

@@ -1,0 +1,187 @@
+// What options files can pick: rigid-body modes, p-multigrid, the fixed-stress matrix.
+#include "unit/scenes.hpp"
+
+namespace pulmo::test {
+namespace {
+
+constexpr const char *springs = " -chest_wall -chest_wall_surfaces x0,y1 -chest_wall_stiffness 0.3 ";
+
+std::string cube(const std::string &mesh)
+{
+  return "-dm_plex_filename " + source("meshes/" + mesh) + " -mesh_scale 1 -tissue yoshihara -pc_type lu ";
+}
+
+/// The Jacobian of a scene at rest, step 0.05 s, no gas pressure.
+PetscErrorCode jacobian_at_rest(SceneRun &run, Mat *A)
+{
+  VecHandle x, x_t;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMCreateLocalVector(run.model().dm(), x.out()));
+  PetscCall(VecDuplicate(x, x_t.out()));
+  PetscCall(run.model().create_matrix(A));
+  PetscCall(run.model().set_step(0.05, 0));
+  PetscCall(run.model().jacobian(0, x, x_t, 20, *A));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+TEST(RigidBodyModes, AFreeBodyAtRestDoesNotResistThem)
+{
+  const Registry registry = Registry::standard();
+  SceneRun run(registry);
+  MatHandle A;
+  VecHandle force;
+  MatNullSpace modes;
+  const Vec *v;
+  PetscInt n;
+  PetscReal size;
+  PULMO_OK(prepare(run, cube("cube.msh")));
+  PULMO_OK(jacobian_at_rest(run, A.out()));
+  PULMO_OK(MatGetNearNullSpace(A, &modes));
+  ASSERT_NE(modes, nullptr);
+  PULMO_OK(MatNullSpaceGetVecs(modes, nullptr, &n, &v));
+  ASSERT_EQ(n, 6);
+  PULMO_OK(MatNorm(A, NORM_INFINITY, &size));
+  PULMO_OK(VecDuplicate(v[0], force.out()));
+  for (PetscInt i = 0; i < n; ++i) {
+    PetscReal f;
+    PULMO_OK(MatMult(A, v[i], force));
+    PULMO_OK(VecNorm(force, NORM_INFINITY, &f));
+    EXPECT_LT(f, 1e-13 * size) << "mode " << i;
+  }
+}
+
+TEST(RigidBodyModes, TheDisplacementSplitCarriesThem)
+{
+  const Registry registry = Registry::standard();
+  SceneRun run(registry);
+  PetscInt n;
+  IS *splits;
+  DM *dms; // asked for, as PCFIELDSPLIT does
+  PetscObject modes = nullptr;
+  PULMO_OK(prepare(run, cube("cube.msh") + springs + "-airflow -airflow_surfaces x1"));
+  PULMO_OK(DMCreateFieldDecomposition(run.model().dm(), &n, nullptr, &splits, &dms));
+  ASSERT_EQ(n, 2);
+  PULMO_OK(PetscObjectQuery((PetscObject)splits[0], "nearnullspace", &modes));
+  EXPECT_NE(modes, nullptr);
+  PULMO_OK(PetscObjectQuery((PetscObject)splits[1], "nearnullspace", &modes));
+  EXPECT_EQ(modes, nullptr);
+  for (PetscInt i = 0; i < n; ++i) {
+    PULMO_OK(ISDestroy(&splits[i]));
+    PULMO_OK(DMDestroy(&dms[i]));
+  }
+  PULMO_OK(PetscFree(dms));
+  PULMO_OK(PetscFree(splits));
+}
+
+/// Iterations of CG to 1e-8 with the preconditioner of the options, on @p mesh.
+int iterations(const std::string &mesh, const std::string &more)
+{
+  const Registry registry = Registry::standard();
+  SceneRun run(registry);
+  MatHandle A;
+  VecHandle b, x;
+  KSP ksp;
+  PetscInt n = -1;
+  KSPConvergedReason reason;
+  const auto solve = [&]() -> PetscErrorCode {
+    PetscFunctionBeginUser;
+    PetscCall(prepare(run, cube(mesh) + more));
+    PetscCall(jacobian_at_rest(run, A.out()));
+    PetscCall(MatCreateVecs(A, x.out(), b.out()));
+    PetscCall(VecSetRandom(b, nullptr));
+    PetscCall(KSPCreate(PETSC_COMM_WORLD, &ksp));
+    PetscCall(KSPSetDM(ksp, run.model().dm()));
+    PetscCall(KSPSetDMActive(ksp, PETSC_FALSE));
+    PetscCall(KSPSetOperators(ksp, A, A));
+    PetscCall(KSPSetOptionsPrefix(ksp, "test_"));
+    PetscCall(KSPSetTolerances(ksp, 1e-8, PETSC_DEFAULT, PETSC_DEFAULT, 2000));
+    PetscCall(KSPSetType(ksp, KSPCG));
+    PetscCall(KSPSetFromOptions(ksp));
+    PetscCall(KSPSolve(ksp, b, x));
+    PetscCall(KSPGetIterationNumber(ksp, &n));
+    PetscCall(KSPGetConvergedReason(ksp, &reason));
+    PetscCall(KSPDestroy(&ksp));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  };
+  EXPECT_EQ(static_cast<int>(solve()), 0);
+  EXPECT_GT(reason, 0) << more;
+  return static_cast<int>(n);
+}
+
+TEST(PMultigrid, IterationsDoNotGrowWithTheMesh)
+{
+  const std::string pmg =
+      "-test_pc_type p_multigrid -test_pmg_levels_ksp_type richardson -test_pmg_levels_ksp_max_it 1 "
+      "-test_pmg_levels_pc_type sor -test_pmg_coarse_ksp_type preonly -test_pmg_coarse_pc_type lu ";
+  // springs on whole nodes, and a support that holds some components only
+  for (const std::string &hold :
+       {std::string(springs), std::string(" -support -support_surfaces x0,y0 -support_components_y0 y ")}) {
+    const int coarse = iterations("cube_coarse.msh", hold + pmg), middle = iterations("cube.msh", hold + pmg),
+              fine = iterations("cube_fine.msh", hold + pmg);
+    EXPECT_LE(middle, 15) << hold;
+    EXPECT_LE(fine, middle + 2) << hold << coarse;
+    EXPECT_GT(iterations("cube_fine.msh", hold + "-test_pc_type jacobi"), 8 * fine);
+  }
+}
+
+/// x' S x / x' S_exact x for several x, with the exact Schur complement on the pressure.
+void expect_equivalent(const std::string &permeability, double low, double high)
+{
+  const Registry registry = Registry::standard();
+  SceneRun run(registry);
+  MatHandle A, A_uu, A_up, A_pu, A_pp, dense, rhs, solution, product, factor;
+  PetscInt n, size;
+  IS *splits;
+  PULMO_OK(
+      prepare(run, cube("cube.msh") + springs + "-airflow -airflow_surfaces x1 -airflow_permeability " + permeability));
+  run.model().hold_airway(false);
+  PULMO_OK(run.model().use_fixed_stress());
+  PULMO_OK(jacobian_at_rest(run, A.out()));
+  PULMO_OK(DMCreateFieldDecomposition(run.model().dm(), &n, nullptr, &splits, nullptr));
+  PULMO_OK(MatCreateSubMatrix(A, splits[0], splits[0], MAT_INITIAL_MATRIX, A_uu.out()));
+  PULMO_OK(MatCreateSubMatrix(A, splits[0], splits[1], MAT_INITIAL_MATRIX, A_up.out()));
+  PULMO_OK(MatCreateSubMatrix(A, splits[1], splits[0], MAT_INITIAL_MATRIX, A_pu.out()));
+  PULMO_OK(MatCreateSubMatrix(A, splits[1], splits[1], MAT_INITIAL_MATRIX, A_pp.out()));
+  PULMO_OK(MatConvert(A_uu, MATDENSE, MAT_INITIAL_MATRIX, dense.out()));
+  PULMO_OK(MatConvert(A_up, MATDENSE, MAT_INITIAL_MATRIX, rhs.out()));
+  PULMO_OK(MatDuplicate(rhs, MAT_DO_NOT_COPY_VALUES, solution.out()));
+  PULMO_OK(MatLUFactor(dense, nullptr, nullptr, nullptr));
+  PULMO_OK(MatMatSolve(dense, rhs, solution));
+  PULMO_OK(MatMatMult(A_pu, solution, MAT_INITIAL_MATRIX, PETSC_DEFAULT, product.out()));
+  PULMO_OK(MatAYPX(product, -1, A_pp, DIFFERENT_NONZERO_PATTERN)); // A_pp - A_pu A_uu^-1 A_up
+  PULMO_OK(MatGetSize(product, &size, nullptr));
+
+  VecHandle x, y;
+  PULMO_OK(MatCreateVecs(product, x.out(), y.out()));
+  PetscRandom random;
+  PULMO_OK(PetscRandomCreate(PETSC_COMM_WORLD, &random));
+  for (PetscInt k = 0; k < 30; ++k) {
+    PetscScalar exact, fixed;
+    PULMO_OK(VecSet(x, k == 0));
+    if (k > 20) {
+      PULMO_OK(VecSetRandom(x, random));
+    } else if (k > 0) {
+      PULMO_OK(VecSetValue(x, k * 3 % size, 1, INSERT_VALUES));
+    }
+    PULMO_OK(MatMult(product, x, y));
+    PULMO_OK(VecDot(x, y, &exact));
+    PULMO_OK(MatMult(run.model().fixed_stress(), x, y));
+    PULMO_OK(VecDot(x, y, &fixed));
+    EXPECT_GT(fixed / exact, low) << k;
+    EXPECT_LT(fixed / exact, high) << k;
+  }
+  PULMO_OK(PetscRandomDestroy(&random));
+  for (PetscInt i = 0; i < n; ++i) PULMO_OK(ISDestroy(&splits[i]));
+  PULMO_OK(PetscFree(splits));
+}
+
+TEST(FixedStress, IsEquivalentToTheSchurComplement)
+{
+  expect_equivalent("1e4", 0.99, 1.01); // flow rules: the block itself
+  expect_equivalent("1", 0.5, 3);
+  expect_equivalent("1e-8", 0.5, 3); // storage rules
+}
+
+} // namespace
+} // namespace pulmo::test
