@@ -528,6 +528,7 @@ PetscErrorCode Simulation::reject(PetscReal dt, const std::string &reason, Petsc
   failures_.push_back({accepted_.time, dt, reason, newton, measures, inverted});
   cut_ = true;
   ++rejected_;
+  PetscCall(TSRestartStep(ts_)); // -ts_theta_initial_guess_extrapolate must not go on from a failed state
   PetscCall(TSGetAdapt(ts_, &adapt));
   const PetscReal next = dt * adapt->scale_solve_failed;
   if (next < std::max(adapt->dt_min, least_step * wanted_dt_))
