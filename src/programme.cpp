@@ -186,9 +186,9 @@ private:
       PulmoUserCheck(!hold && (key == "ramp" || key == "from" || (key == "limit" && control == Control::flow)), comm_,
                      "%s:%d: '%s' does not belong to a %s phase; %s", file_.c_str(), line.number, key.c_str(),
                      w[2].c_str(),
-                     hold                         ? "hold takes nothing more"
+                     hold                       ? "hold takes nothing more"
                      : control == Control::flow ? "it may have 'from', 'ramp' and 'limit'"
-                                                  : "it may have 'from' and 'ramp'");
+                                                : "it may have 'from' and 'ramp'");
       PulmoUserCheck(next + 1 < w.size(), comm_, "%s:%d: '%s' needs a number", file_.c_str(), line.number, key.c_str());
       PetscReal x;
       PetscCall(number(line, next + 1, "'" + key + "'", x));

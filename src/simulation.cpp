@@ -266,8 +266,7 @@ std::vector<Phase> Simulation::phases() const
   (void)TSGetMaxTime(ts_, &max_time);
   if (scene_.facts().ventilator)
     list = scene_.facts().ventilator->phases();
-  else
-  {
+  else {
     Phase run;
     run.name = "run";
     run.end = max_time < PETSC_MAX_REAL ? max_time : 1;

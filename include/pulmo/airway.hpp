@@ -12,7 +12,8 @@ namespace pulmo {
 /// held    the pressure is prescribed on the open surfaces;
 /// free    the flux is prescribed there, by area, and the pressure field is free;
 /// common  the whole airway (without airflow: all gas) has one pressure P, the unknown of one scalar equation c = 0:
-///         a prescribed volume, (V - V_target) / h^3, or the tube's drop, (P + K1 Q + K2 |Q| Q - P_ventilator) / modulus.
+///         a prescribed volume, (V - V_target) / h^3, or the tube's drop, (P + K1 Q + K2 |Q| Q - P_ventilator) /
+///         modulus.
 ///
 /// A flow phase prescribes the volume at the end of each step, so that errors of the solver do not add up.
 class Airway {
@@ -41,7 +42,10 @@ public:
   /// Pressure at the airway, kPa: what is held, the unknown, or the mean over the free surface.
   PetscErrorCode pressure(Vec local, PetscReal &pressure);
   /// Pressure at the ventilator's side of the tube, kPa, at flow @p flow into the lung, mm^3/s.
-  PetscReal ventilator_pressure(PetscReal flow) const { return pressure_ + (facts_.tube ? facts_.tube->drop(flow) : 0); }
+  PetscReal ventilator_pressure(PetscReal flow) const
+  {
+    return pressure_ + (facts_.tube ? facts_.tube->drop(flow) : 0);
+  }
   /// If the phase has a limit that the ventilator's pressure exceeds: holds the limit from now on and tells so.
   bool limit(PetscReal flow);
 
@@ -56,10 +60,10 @@ private:
   const SceneFacts &facts_;
   Phase phase_;
   Mode mode_ = Mode::held;
-  PetscReal pressure_ = 0;                           ///< at the airway, kPa
-  PetscReal target_ = 0;                             ///< pressure that the phase prescribes, kPa
-  PetscReal volume_begin_ = 0, volume_before_ = 0;   ///< at the begin of the phase, of the step, mm^3
-  PetscReal volume_target_ = 0, volume_ = 0;         ///< prescribed; at the last close(), mm^3
+  PetscReal pressure_ = 0;                         ///< at the airway, kPa
+  PetscReal target_ = 0;                           ///< pressure that the phase prescribes, kPa
+  PetscReal volume_begin_ = 0, volume_before_ = 0; ///< at the begin of the phase, of the step, mm^3
+  PetscReal volume_target_ = 0, volume_ = 0;       ///< prescribed; at the last close(), mm^3
   PetscReal dt_ = 1;
 };
 

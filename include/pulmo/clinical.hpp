@@ -11,14 +11,14 @@ namespace pulmo {
 
 /// One accepted step; row 0 is the start of the run. Flow into the lung is positive.
 struct SignalRow {
-  double time = 0;     ///< s
-  double pressure = 0; ///< airway pressure, cmH2O
+  double time = 0;                ///< s
+  double pressure = 0;            ///< airway pressure, cmH2O
   double ventilator_pressure = 0; ///< at the machine's side of the tube, cmH2O; the airway pressure without one
-  double flow = 0;     ///< ml/s, of the step that ends here
-  double volume = 0;   ///< ml, int (J - 1)
-  std::string phase;   ///< of the programme; the phase that ends at its last row
-  int breath = 0;      ///< counted from 1; 0 before the first
-  double dt = 0;       ///< s
+  double flow = 0;                ///< ml/s, of the step that ends here
+  double volume = 0;              ///< ml, int (J - 1)
+  std::string phase;              ///< of the programme; the phase that ends at its last row
+  int breath = 0;                 ///< counted from 1; 0 before the first
+  double dt = 0;                  ///< s
   long newton = 0, krylov = 0;
   double min_J = 1, max_J = 1;
 };

@@ -18,13 +18,13 @@ enum class Control {
 
 /// One phase (begin, end]: the controlled quantity goes linearly from @p from to @p to within @p ramp and stays.
 struct Phase {
-  std::string name;              ///< inspiration, pause, expiration, settle, ...
-  PetscInt breath = 0;           ///< counted from 1; 0 before the first breath
-  PetscReal begin = 0, end = 0;  ///< s
+  std::string name;             ///< inspiration, pause, expiration, settle, ...
+  PetscInt breath = 0;          ///< counted from 1; 0 before the first breath
+  PetscReal begin = 0, end = 0; ///< s
   Control control = Control::pressure;
-  std::optional<PetscReal> from; ///< kPa or mm^3/s; not given: what the airway has when the phase begins
-  PetscReal to = 0;              ///< kPa or mm^3/s
-  PetscReal ramp = 0;            ///< s; 0: @p to holds from the first step on
+  std::optional<PetscReal> from;  ///< kPa or mm^3/s; not given: what the airway has when the phase begins
+  PetscReal to = 0;               ///< kPa or mm^3/s
+  PetscReal ramp = 0;             ///< s; 0: @p to holds from the first step on
   std::optional<PetscReal> limit; ///< of the airway pressure in a flow phase, kPa: reached, it is held to the end
 
   /// The controlled quantity at a time of this phase (from must be known if there is a ramp).

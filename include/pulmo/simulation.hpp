@@ -42,7 +42,8 @@ struct StageSeconds {
 
 class Simulation {
 public:
-  Simulation(const Options &options, const Scene &scene, Model &model) : options_(options), scene_(scene), model_(model), airway_(model, scene.facts())
+  Simulation(const Options &options, const Scene &scene, Model &model)
+      : options_(options), scene_(scene), model_(model), airway_(model, scene.facts())
   {}
 
   /// Creates TS, SNES, KSP and the matrix from the options database.
@@ -110,7 +111,7 @@ private:
   std::vector<SignalRow> rows_;
   PetscReal delivered_ = 0, worst_balance_ = 0, min_J_ = 1;
   PetscInt newton_ = 0, krylov_ = 0, rejected_ = 0;
-  int extra_newton_ = 0; ///< Newton steps of the attempt at hand for the prescribed volume alone
+  int extra_newton_ = 0;  ///< Newton steps of the attempt at hand for the prescribed volume alone
   bool inverted_ = false; ///< the attempt at hand met J <= 0
   bool cut_ = false;      ///< the step at hand was cut
   int crawled_ = 0;       ///< accepted steps in a row that were tiny

@@ -1,93 +1,11 @@
-// The ventilator's programme and the clinical numbers, from signals made by hand.
+// The clinical numbers, from signals made by hand.
 #include "unit/scenes.hpp"
 
 #include "pulmo/clinical.hpp"
-#include "pulmo/effects/ventilator.hpp"
 #include "pulmo/units.hpp"
 
 namespace pulmo::test {
 namespace {
-
-// ---------------------------------------------------------------------------------------------------- programme
-
-TEST(Programme, RampsAndPlateaus)
-{
-  const Phase ramped{"inspiration", 1, 2.0, 3.0, 0.1, 0.6, 0.25};
-  EXPECT_DOUBLE_EQ(ramped.pressure(2.0), 0.1);
-  EXPECT_DOUBLE_EQ(ramped.pressure(2.125), 0.35);
-  EXPECT_DOUBLE_EQ(ramped.pressure(2.25), 0.6);
-  EXPECT_DOUBLE_EQ(ramped.pressure(3.0), 0.6);
-  const Phase sudden{"expiration", 1, 3.0, 5.0, 0.6, 0.1, 0};
-  EXPECT_DOUBLE_EQ(sudden.pressure(3.0 + 1e-9), 0.1);
-}
-
-TEST(Programme, PhasesAreOpenOnTheLeft)
-{
-  const Programme programme({{"inspiration", 1, 0, 1, 0, 0.6, 0.5}, {"expiration", 1, 1, 3, 0.6, 0, 0}});
-  EXPECT_EQ(programme.end(), 3);
-  EXPECT_DOUBLE_EQ(programme.pressure(0), 0);
-  EXPECT_DOUBLE_EQ(programme.pressure(-1), 0);
-  EXPECT_DOUBLE_EQ(programme.pressure(0.25), 0.3);
-  EXPECT_DOUBLE_EQ(programme.pressure(1), 0.6); // belongs to the phase that ends
-  EXPECT_DOUBLE_EQ(programme.pressure(1 + 1e-9), 0);
-  EXPECT_DOUBLE_EQ(programme.pressure(3), 0);
-  EXPECT_DOUBLE_EQ(programme.pressure(9), 0);
-  EXPECT_EQ(Programme({}).pressure(1), 0);
-}
-
-/// The programme of ventilator options.
-Programme programme_of(const std::string &given)
-{
-  Ventilator ventilator;
-  Options options(PETSC_COMM_WORLD);
-  EXPECT_EQ(static_cast<int>(set_options("-ventilator pcv " + given)), 0);
-  EXPECT_EQ(static_cast<int>(ventilator.declare(options)), 0);
-  return ventilator.programme();
-}
-
-TEST(Programme, DefaultsOfPressureControl)
-{
-  const Programme p = programme_of("");
-  ASSERT_EQ(p.phases().size(), 2u);
-  EXPECT_EQ(p.phases()[0].name, "inspiration");
-  EXPECT_EQ(p.phases()[1].name, "expiration");
-  EXPECT_DOUBLE_EQ(p.end(), 3);
-  const double pip = 6 * 0.0980665;
-  EXPECT_DOUBLE_EQ(p.pressure(0.05), pip / 2);
-  EXPECT_DOUBLE_EQ(p.pressure(0.1), pip);
-  EXPECT_DOUBLE_EQ(p.pressure(1), pip);
-  EXPECT_DOUBLE_EQ(p.pressure(1.0001), 0);
-}
-
-TEST(Programme, PeepSettlesFirstAndBreathsFollowWithoutGaps)
-{
-  const Programme p = programme_of("-ventilator_pip 15 -ventilator_peep 5 -ventilator_pause 0.4 -ventilator_breaths 3"
-                                   " -ventilator_inspiration 0.8 -ventilator_expiration 1.6 -ventilator_ramp 0.2"
-                                   " -ventilator_ramp_down 0.3");
-  const char *names[] = {"settle", "inspiration", "pause",       "expiration", "inspiration",
-                         "pause",  "expiration",  "inspiration", "pause",      "expiration"};
-  ASSERT_EQ(p.phases().size(), 10u);
-  double t = 0;
-  for (std::size_t i = 0; i < 10; ++i) {
-    const Phase &phase = p.phases()[i];
-    EXPECT_EQ(phase.name, names[i]);
-    EXPECT_EQ(phase.breath, i == 0 ? 0 : static_cast<PetscInt>((i + 2) / 3));
-    EXPECT_DOUBLE_EQ(phase.begin, t);
-    if (i > 0) {
-      EXPECT_DOUBLE_EQ(phase.from, p.phases()[i - 1].to) << "a jump into " << phase.name;
-    }
-    t = phase.end;
-  }
-  EXPECT_NEAR(p.end(), 0.2 + 1.6 + 3 * 2.8, 1e-12);
-  const double k = 0.0980665;
-  EXPECT_DOUBLE_EQ(p.phases()[0].end, 1.8);     // ramp and one expiration
-  EXPECT_NEAR(p.pressure(0.1), 2.5 * k, 1e-14); // settle's ramp
-  EXPECT_NEAR(p.pressure(1.8), 5 * k, 1e-14);
-  EXPECT_NEAR(p.pressure(1.9), 10 * k, 1e-14);        // half of the ramp
-  EXPECT_NEAR(p.pressure(2.8), 15 * k, 1e-14);        // pause
-  EXPECT_NEAR(p.pressure(3.0 + 0.15), 10 * k, 1e-12); // ramp down
-  EXPECT_NEAR(p.pressure(p.end()), 5 * k, 1e-14);
-}
 
 // --------------------------------------------------------------------------------------------------------- numbers
 

@@ -204,9 +204,9 @@ void expect_rows_and_entries(SceneRun &run, const SceneSpec &scene)
       continue;
     }
     PULMO_OK(run.scene().mesh().node_coordinates(p, x));
-    const int held = held_at(scene, x) & (vertex ? 15 : 7);
+    const int held = held_at(scene, x); // the airway's pressure stays in the section: its rows are closed instead
     std::set<PetscInt> expected, found;
-    for (int c = 0; c < 4; ++c)
+    for (int c = 0; c < 3; ++c)
       if (held & (1 << c)) expected.insert(c);
     const PetscInt *which = nullptr;
     if (constrained) {
@@ -353,7 +353,8 @@ TEST(Composition, PrescribedValuesArePutIntoTheState)
   PULMO_OK(prepare(run, scene.options()));
   PULMO_OK(DMCreateLocalVector(run.model().dm(), x.out()));
   PULMO_OK(VecSet(x, 7));
-  const double t = 0.04, p = 6 * 0.0980665 * t / 0.1; // on the ramp
+  const double t = 0.04, p = 0.235;
+  PULMO_OK(run.model().set_step(0.04, p));
   PULMO_OK(run.model().constrain(t, x));
   const ReadArray values(x);
   PULMO_OK(for_each_dof(run, [&](PetscInt dof, PetscInt field, PetscInt component, const PetscReal X[3]) {

@@ -2,8 +2,8 @@
 /// Effect `tube`: the endotracheal tube between ventilator and airway.
 ///
 /// Pressure drop after Rohrer (1915): P_ventilator - P_airway = K1 Q + K2 |Q| Q with the flow Q into the lung; K2 = 0
-/// is a linear resistance. The tube ends in one airway pressure, which a pressure phase leaves to be solved for; in flow
-/// phases the drop is only added to what the ventilator shows.
+/// is a linear resistance. The tube ends in one airway pressure, which a pressure phase leaves to be solved for; in
+/// flow phases the drop is only added to what the ventilator shows.
 #pragma once
 
 #include "pulmo/effect.hpp"
@@ -31,8 +31,8 @@ public:
   PetscErrorCode announce(SceneFacts &facts) override
   {
     constexpr PetscReal mm3_per_l = 1000 * units::mm3_per_ml;
-    facts.tube = AirwayResistance{k1_ * units::kPa_per_cmH2O / mm3_per_l,
-                                  k2_ * units::kPa_per_cmH2O / (mm3_per_l * mm3_per_l)};
+    facts.tube =
+        AirwayResistance{k1_ * units::kPa_per_cmH2O / mm3_per_l, k2_ * units::kPa_per_cmH2O / (mm3_per_l * mm3_per_l)};
     return PETSC_SUCCESS;
   }
 

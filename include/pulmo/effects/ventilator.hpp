@@ -34,7 +34,10 @@ struct AirwayFluxKernels {
 class Ventilator final : public Effect {
 public:
   const char *name() const override { return "ventilator"; }
-  const char *about() const override { return "PCV, VCV, supersyringe or a programme of phases (sections 2.5, 2.6, 2.8)"; }
+  const char *about() const override
+  {
+    return "PCV, VCV, supersyringe or a programme of phases (sections 2.5, 2.6, 2.8)";
+  }
   bool active() const override { return mode_ != "off"; }
 
   PetscErrorCode declare(Options &options) override
@@ -58,8 +61,8 @@ public:
     PetscCall(options.real("tidal_volume", "ml", Range::positive(), "volume of one inspiration, of the whole mesh",
                            tidal_volume_));
     options.group(name(), "supersyringe", syringe, "-ventilator supersyringe");
-    PetscCall(options.whole("steps", "-", Range::between(1, 100000), "steps of inflation, and as many of deflation",
-                            steps_));
+    PetscCall(
+        options.whole("steps", "-", Range::between(1, 100000), "steps of inflation, and as many of deflation", steps_));
     PetscCall(options.real("step_volume", "ml", Range::positive(), "volume of one step", step_volume_));
     options.group(name(), "pressure and volume control", pcv || vcv, "-ventilator pcv or vcv");
     PetscCall(options.real("peep", "cmH2O", Range::any(), "positive end-expiratory pressure", peep_));
@@ -80,14 +83,15 @@ public:
     options.group(name(), "programme", mode_ == "programme", "-ventilator programme");
     PetscCall(options.text("programme", "file of phases (docs/ventilator.md)", file_));
     options.group(name(), "prescribed flow", active() && !pcv, "-ventilator vcv, supersyringe or programme");
-    PetscCall(options.choice("flow_split", {"uniform", "common_pressure"},
-                             "how patches of airway share a prescribed flow: by area, or so that they have one pressure",
-                             split_));
+    PetscCall(options.choice(
+        "flow_split", {"uniform", "common_pressure"},
+        "how patches of airway share a prescribed flow: by area, or so that they have one pressure", split_));
 
     PetscCall(check_settings(options));
     if (mode_ == "programme") {
-      PulmoUserCheck(!file_.empty(), options.comm(),
-                     "-ventilator programme needs -ventilator_programme FILE (docs/ventilator.md shows how to write it)");
+      PulmoUserCheck(
+          !file_.empty(), options.comm(),
+          "-ventilator programme needs -ventilator_programme FILE (docs/ventilator.md shows how to write it)");
       PetscCall(read_programme(options.comm(), "-ventilator_programme", file_, read_));
     }
     PetscFunctionReturn(PETSC_SUCCESS);
