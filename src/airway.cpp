@@ -17,15 +17,16 @@ constexpr PetscReal volume_tolerance = 1e-10;
 void Airway::begin_phase(const Phase &phase, PetscReal volume)
 {
   phase_ = phase;
-  if (!phase_.from) phase_.from = pressure_;
+  if (!phase_.from) phase_.from = ventilator_before_;
   volume_begin_ = volume_before_ = volume;
-  set_mode();
+  limited_ = limited_before_ = retake_ = false;
 }
 
 void Airway::set_mode()
 {
-  if (phase_.control == Control::flow)
-    mode_ = facts_.free_airway() ? Mode::free : Mode::common;
+  // the mean over a free surface is no pressure that can be held instead: a limit needs a common one
+  if (control() == Control::flow)
+    mode_ = facts_.free_airway() && !phase_.limit ? Mode::free : Mode::common;
   else
     mode_ = facts_.tube ? Mode::common : Mode::held;
 }
@@ -33,10 +34,13 @@ void Airway::set_mode()
 void Airway::begin_step(PetscReal t, PetscReal dt)
 {
   dt_ = dt;
-  if (phase_.control == Control::flow)
+  limited_ = limited_before_ || retake_; // a cut step may stay below the limit
+  retake_ = false;
+  set_mode();
+  if (control() == Control::flow)
     volume_target_ = volume_begin_ + phase_.delivered(t);
   else
-    target_ = phase_.value(t);
+    target_ = limited_ ? *phase_.limit : phase_.value(t);
   pressure_ = mode_ == Mode::held ? target_ : pressure_before_; // not what a failed attempt left
 }
 
@@ -63,8 +67,8 @@ PetscErrorCode Airway::close(PetscReal volume, Vec F)
   PetscCall(model_.close_rows(F));
   if (mode_ == Mode::common) {
     const PetscReal h = model_.composition().mesh().length(), Q = (volume - volume_before_) / dt_;
-    const PetscReal c = phase_.control == Control::flow ? (volume - volume_target_) / (h * h * h)
-                                                        : (ventilator_pressure(Q) - target_) / model_.modulus();
+    const PetscReal c = control() == Control::flow ? (volume - volume_target_) / (h * h * h)
+                                                   : (ventilator_pressure(Q) - target_) / model_.modulus();
     PetscCall(model_.set_carrier_value(F, c));
   }
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -73,7 +77,7 @@ PetscErrorCode Airway::close(PetscReal volume, Vec F)
 PetscReal Airway::change(PetscReal c, PetscReal c_P, PetscReal volume_fixed, PetscReal volume_per_P) const
 {
   const PetscReal h = model_.composition().mesh().length();
-  const PetscReal c_V = phase_.control == Control::flow
+  const PetscReal c_V = control() == Control::flow
                             ? 1 / (h * h * h)
                             : facts_.tube->slope((volume_ - volume_before_) / dt_) / (dt_ * model_.modulus());
   return -(c + c_V * volume_fixed) / (c_P + c_V * volume_per_P);
@@ -81,7 +85,7 @@ PetscReal Airway::change(PetscReal c, PetscReal c_P, PetscReal volume_fixed, Pet
 
 bool Airway::satisfied() const
 {
-  if (phase_.control != Control::flow) return true;
+  if (control() != Control::flow) return true;
   const PetscReal scale = std::max(std::abs(volume_target_), PetscReal(1e-3) * model_.composition().mesh().volume());
   return std::abs(volume_ - volume_target_) <= volume_tolerance * scale;
 }
@@ -96,12 +100,8 @@ PetscErrorCode Airway::pressure(Vec local, PetscReal &pressure)
 
 bool Airway::limit(PetscReal flow)
 {
-  if (!phase_.limit || ventilator_pressure(flow) <= *phase_.limit) return false;
-  phase_.control = Control::pressure;
-  phase_.from = phase_.to = *phase_.limit;
-  phase_.limit.reset();
-  set_mode();
-  return true;
+  retake_ = phase_.limit && !limited_ && ventilator_pressure(flow) > *phase_.limit;
+  return retake_;
 }
 
 } // namespace pulmo

@@ -137,10 +137,8 @@ PetscErrorCode EnergyAudit::observe(const StepReport &step)
   const MPI_Comm comm = PetscObjectComm((PetscObject)model_.dm());
   const SignalRow &row = step.row;
   EnergyBalance balance;
-  PetscLogDouble start, end;
 
   PetscFunctionBeginUser;
-  PetscCall(PetscTime(&start));
   if (rows_.empty()) {
     balance.accounts.assign(accounts_.size(), 0);
   } else {
@@ -167,8 +165,6 @@ PetscErrorCode EnergyAudit::observe(const StepReport &step)
   rows_.push_back(balance);
   gas_pressure_ = row.pressure * units::kPa_per_cmH2O;
   PetscCall(VecCopy(step.local, before_));
-  PetscCall(PetscTime(&end));
-  seconds_ += end - start;
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -388,22 +388,22 @@ PetscErrorCode Mesh::require_surfaces(const std::vector<std::string> &names, con
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Mesh::node_coordinates(PetscInt point, PetscReal x[3]) const
+PetscErrorCode node_coordinates(DM dm, PetscInt point, PetscReal x[3])
 {
   PetscInt vertex_begin, vertex_end;
   PetscSection section;
   Vec coordinates;
 
   PetscFunctionBeginUser;
-  PetscCall(DMPlexGetDepthStratum(dm_, 0, &vertex_begin, &vertex_end));
-  PetscCall(DMGetCoordinateSection(dm_, &section));
-  PetscCall(DMGetCoordinatesLocal(dm_, &coordinates));
+  PetscCall(DMPlexGetDepthStratum(dm, 0, &vertex_begin, &vertex_end));
+  PetscCall(DMGetCoordinateSection(dm, &section));
+  PetscCall(DMGetCoordinatesLocal(dm, &coordinates));
   const ReadArray values(coordinates);
   const PetscInt *ends = &point;
   PetscInt n = 1;
   if (point < vertex_begin || point >= vertex_end) {
-    PetscCall(DMPlexGetCone(dm_, point, &ends));
-    PetscCall(DMPlexGetConeSize(dm_, point, &n));
+    PetscCall(DMPlexGetCone(dm, point, &ends));
+    PetscCall(DMPlexGetConeSize(dm, point, &n));
   }
   for (int d = 0; d < 3; ++d) x[d] = 0;
   for (PetscInt i = 0; i < n; ++i) {

@@ -346,9 +346,10 @@ PetscErrorCode Model::add_carrier(SectionHandle &section)
   PetscMPIInt rank;
 
   PetscFunctionBeginUser;
-  PulmoUserCheck(own_, comm,
-                 "-petscfe_type basic cannot carry the unknown gas pressure of a flow phase without -airflow; use the "
-                 "default, pulmo");
+  PulmoUserCheck(
+      own_, comm,
+      "-petscfe_type basic cannot carry the unknown gas pressure of a flow phase or a tube without -airflow; use the "
+      "default, pulmo");
   PetscCallMPI(MPI_Comm_rank(comm, &rank));
   PetscCall(DMPlexGetHeightStratum(dm_, 0, &cell_begin, &cell_end));
   PetscMPIInt first = cell_end > cell_begin ? rank : PETSC_MPI_INT_MAX;

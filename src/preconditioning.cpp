@@ -1,5 +1,6 @@
 #include "pulmo/preconditioning.hpp"
 
+#include "pulmo/mesh.hpp"
 #include "pulmo/point.hpp"
 
 #include <algorithm>
@@ -10,44 +11,6 @@
 namespace pulmo {
 
 namespace {
-
-/// Coordinates of a vertex, or of the middle of an edge.
-class NodeCoordinates {
-public:
-  PetscErrorCode open(DM dm)
-  {
-    PetscFunctionBeginUser;
-    dm_ = dm;
-    PetscCall(DMGetCoordinatesLocal(dm, &coordinates_));
-    PetscCall(DMGetCoordinateSection(dm, &section_));
-    PetscCall(DMPlexGetDepthStratum(dm, 0, &vertex_begin_, &vertex_end_));
-    PetscFunctionReturn(PETSC_SUCCESS);
-  }
-  PetscErrorCode of(PetscInt point, PetscReal x[3]) const
-  {
-    const PetscInt *ends = &point;
-    PetscInt n = 1, offset;
-
-    PetscFunctionBeginUser;
-    if (point < vertex_begin_ || point >= vertex_end_) {
-      PetscCall(DMPlexGetCone(dm_, point, &ends));
-      PetscCall(DMPlexGetConeSize(dm_, point, &n));
-    }
-    const ReadArray xs(coordinates_);
-    x[0] = x[1] = x[2] = 0;
-    for (PetscInt e = 0; e < n; ++e) {
-      PetscCall(PetscSectionGetOffset(section_, ends[e], &offset));
-      for (PetscInt d = 0; d < 3; ++d) x[d] += xs[offset + d] / n;
-    }
-    PetscFunctionReturn(PETSC_SUCCESS);
-  }
-
-private:
-  DM dm_ = nullptr;
-  Vec coordinates_ = nullptr;
-  PetscSection section_ = nullptr;
-  PetscInt vertex_begin_ = 0, vertex_end_ = 0;
-};
 
 /// Global number of each free dof of field @p f at a point, -1 for a constrained one. Also for ghosts.
 PetscErrorCode free_dofs(PetscSection section, PetscSection global, PetscInt point, PetscInt f, PetscInt dofs[3],
@@ -79,12 +42,10 @@ PetscErrorCode free_dofs(PetscSection section, PetscSection global, PetscInt poi
 PetscErrorCode rigid_body_modes(DM dm, PetscSection section, PetscSection global, PetscInt f, MatNullSpace *modes)
 {
   const MPI_Comm comm = PetscObjectComm((PetscObject)dm);
-  NodeCoordinates nodes;
   PetscInt begin, end, size;
   Vec v[6];
 
   PetscFunctionBeginUser;
-  PetscCall(nodes.open(dm));
   PetscCall(PetscSectionGetConstrainedStorageSize(global, &size));
   for (Vec &mode : v) PetscCall(VecCreateMPI(comm, size, PETSC_DETERMINE, &mode));
   PetscCall(PetscSectionGetChart(section, &begin, &end));
@@ -94,7 +55,7 @@ PetscErrorCode rigid_body_modes(DM dm, PetscSection section, PetscSection global
     bool owned = false;
     PetscCall(free_dofs(section, global, p, f, dofs, n, owned));
     if (n != 3 || !owned) continue;
-    PetscCall(nodes.of(p, x));
+    PetscCall(node_coordinates(dm, p, x));
     for (PetscInt d = 0; d < 3; ++d) {
       const PetscInt next = (d + 1) % 3, last = (d + 2) % 3; // rotation about axis k moves along k+1 by -x[k+2], ...
       if (dofs[d] < 0) continue;
@@ -346,7 +307,6 @@ PetscErrorCode attach_rigid_body_modes(DM dm)
 PetscErrorCode FixedStress::setup(DM dm)
 {
   const PetscInt field = pressure;
-  NodeCoordinates coordinates;
   PetscSection section, global;
   DMHandle sub;
   ISHandle is;
@@ -369,7 +329,6 @@ PetscErrorCode FixedStress::setup(DM dm)
     row[p] = dofs[0];
     if (owned) point_row_[p] = dofs[0];
   }
-  PetscCall(coordinates.open(dm));
   PetscCall(DMGetLocalSection(dm, &section));
   PetscCall(DMPlexGetHeightStratum(dm, 0, &cell_begin, &cell_end));
   for (PetscInt c = cell_begin; c < cell_end; ++c) {
@@ -382,7 +341,7 @@ PetscErrorCode FixedStress::setup(DM dm)
       PetscCall(PetscSectionGetFieldDof(section, closure[2 * i], displacement, &dof));
       if (dof != 3) continue;
       x.emplace_back();
-      PetscCall(coordinates.of(closure[2 * i], x.back().data()));
+      PetscCall(node_coordinates(dm, closure[2 * i], x.back().data()));
     }
     for (PetscInt i = n_closure - vertices_; i < n_closure; ++i) rows_.push_back(row[closure[2 * i]]); // come last
     PetscCall(DMPlexRestoreTransitiveClosure(dm, c, PETSC_TRUE, &n_closure, &closure));

@@ -13,6 +13,8 @@ namespace {
 
 /// More phases than this in a file are a slip (a repeat count with a digit too many).
 constexpr std::size_t max_phases = 1000000;
+/// Shorter phases would be lost in the rounding of the clock, s.
+constexpr PetscReal least_duration = 1e-6;
 
 PetscReal internal(Control control, PetscReal value)
 {
@@ -38,6 +40,11 @@ PetscReal Phase::delivered(PetscReal t) const
 bool Programme::prescribes_flow() const
 {
   return std::any_of(phases_.begin(), phases_.end(), [](const Phase &p) { return p.control == Control::flow; });
+}
+
+bool Programme::limits_pressure() const
+{
+  return std::any_of(phases_.begin(), phases_.end(), [](const Phase &p) { return p.limit.has_value(); });
 }
 
 Phase &ProgrammeBuilder::add(const std::string &name, PetscInt breath, PetscReal duration, Control control,
@@ -75,7 +82,8 @@ struct Line {
 std::vector<Line> cut(const std::string &text)
 {
   std::vector<Line> lines;
-  std::istringstream in(text);
+  const bool byte_order_mark = text.compare(0, 3, "\xEF\xBB\xBF") == 0;
+  std::istringstream in(text.substr(byte_order_mark ? 3 : 0));
   std::string raw;
   for (int number = 1; std::getline(in, raw); ++number) {
     std::istringstream words(raw.substr(0, raw.find('#')));
@@ -156,8 +164,8 @@ private:
   PetscErrorCode phase(const Line &line)
   {
     const auto &w = line.words;
-    PetscReal duration, value = 0, ramp = 0;
-    std::optional<PetscReal> from, limit;
+    PetscReal duration, value = 0;
+    std::optional<PetscReal> from, limit, ramp_given;
     std::size_t next = 3;
 
     PetscFunctionBeginUser;
@@ -168,8 +176,9 @@ private:
     PulmoUserCheck(w.size() >= 3, comm_, "%s:%d: phase '%s' needs a duration in s and pressure, flow or hold",
                    file_.c_str(), line.number, w[0].c_str());
     PetscCall(number(line, 1, "the duration (s)", duration));
-    PulmoUserCheck(duration > 0, comm_, "%s:%d: the duration %s s of phase '%s' must be positive", file_.c_str(),
-                   line.number, w[1].c_str(), w[0].c_str());
+    PulmoUserCheck(duration >= least_duration, comm_,
+                   "%s:%d: the duration %s s of phase '%s' must be positive, at least %g s", file_.c_str(), line.number,
+                   w[1].c_str(), w[0].c_str(), (double)least_duration);
     const bool hold = w[2] == "hold";
     PulmoUserCheck(hold || w[2] == "pressure" || w[2] == "flow", comm_,
                    "%s:%d: '%s' is no kind of phase; write pressure, flow or hold", file_.c_str(), line.number,
@@ -192,11 +201,11 @@ private:
       PulmoUserCheck(next + 1 < w.size(), comm_, "%s:%d: '%s' needs a number", file_.c_str(), line.number, key.c_str());
       PetscReal x;
       PetscCall(number(line, next + 1, "'" + key + "'", x));
-      if (key == "ramp")
-        ramp = x;
-      else
-        (key == "from" ? from : limit) = x;
+      std::optional<PetscReal> &given = key == "ramp" ? ramp_given : key == "from" ? from : limit;
+      PulmoUserCheck(!given, comm_, "%s:%d: '%s' is given twice; keep one", file_.c_str(), line.number, key.c_str());
+      given = x;
     }
+    const PetscReal ramp = ramp_given.value_or(0);
     PulmoUserCheck(ramp >= 0 && ramp <= duration, comm_,
                    "%s:%d: the ramp %g s must lie between 0 and the duration %g s of phase '%s'", file_.c_str(),
                    line.number, (double)ramp, (double)duration, w[0].c_str());
@@ -217,8 +226,9 @@ private:
 
     PetscFunctionBeginUser;
     value = std::strtod(text.c_str(), &rest);
-    PulmoUserCheck(*rest == '\0' && std::isfinite(value), comm_, "%s:%d: %s must be a number, not '%s'", file_.c_str(),
-                   line.number, what.c_str(), text.c_str());
+    const bool decimal = text.find_first_not_of("+-.0123456789eE") == std::string::npos;
+    PulmoUserCheck(decimal && *rest == '\0' && std::isfinite(value), comm_, "%s:%d: %s must be a number, not '%s'",
+                   file_.c_str(), line.number, what.c_str(), text.c_str());
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 

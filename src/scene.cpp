@@ -6,13 +6,11 @@ Scene::Scene(const Registry &registry)
 {
   auto tissue = std::make_unique<Tissue>(registry.make_tissue_laws());
   auto airflow = std::make_unique<Airflow>(registry.make_permeability_laws());
-  auto ventilator = std::make_unique<Ventilator>();
   tissue_ = tissue.get();
   airflow_ = airflow.get();
-  ventilator_ = ventilator.get();
   effects_.push_back(std::move(tissue));
   effects_.push_back(std::move(airflow));
-  effects_.push_back(std::move(ventilator));
+  effects_.push_back(std::make_unique<Ventilator>());
   for (auto &effect : registry.make_effects()) effects_.push_back(std::move(effect));
 }
 

@@ -238,6 +238,14 @@ PetscErrorCode Simulation::create_solver()
     PulmoUserCheck(newton, comm,
                    "-snes_type: an airway pressure that is an unknown of its own needs Newton with line search; use "
                    "-snes_type newtonls");
+    for (const char *option : {"-snes_mf", "-snes_mf_operator", "-snes_fd", "-snes_fd_color"}) {
+      PetscBool given = PETSC_FALSE;
+      PetscCall(PetscOptionsGetBool(nullptr, nullptr, option, &given, nullptr));
+      PulmoUserCheck(!given, comm,
+                     "%s: an airway pressure that is an unknown of its own needs the assembled Jacobian; "
+                     "leave the option out",
+                     option);
+    }
     PetscCall(SNESGetLineSearch(snes, &search));
     PetscCall(SNESLineSearchSetPreCheck(search, newton_step, this));
     PetscCall(VecDuplicate(state_, border_x_.out()));
@@ -528,7 +536,7 @@ PetscErrorCode Simulation::reject(PetscReal dt, const std::string &reason, Petsc
   failures_.push_back({accepted_.time, dt, reason, newton, measures, inverted});
   cut_ = true;
   ++rejected_;
-  PetscCall(TSRestartStep(ts_)); // -ts_theta_initial_guess_extrapolate must not go on from a failed state
+  PetscCall(TSRestartStep(ts_)); // if -ts_theta_initial_guess_extrapolate is on: not from a failed state
   PetscCall(TSGetAdapt(ts_, &adapt));
   const PetscReal next = dt * adapt->scale_solve_failed;
   if (next < std::max(adapt->dt_min, least_step * wanted_dt_))
@@ -581,12 +589,12 @@ PetscErrorCode Simulation::after_step()
     row.flow = (row.volume - accepted_.volume) / row.dt;
   }
   PetscCall(VecCopy(local_, before_));
-  airway_.accept(measures.volume_change);
+  airway_.accept(measures.volume_change, row.flow * units::mm3_per_ml);
   row.time = t;
   row.pressure = pressure / units::kPa_per_cmH2O;
   row.ventilator_pressure = airway_.ventilator_pressure(row.flow * units::mm3_per_ml) / units::kPa_per_cmH2O;
   row.phase = phase_->name;
-  row.hold = phase_->control == Control::flow && phase_->to == 0 && phase_->ramp == 0;
+  row.hold = airway_.holds_volume();
   row.breath = static_cast<int>(phase_->breath);
   row.newton = newton_;
   row.krylov = krylov_;
@@ -636,11 +644,13 @@ std::string Simulation::failure_text() const
   }
   text << ". What to try: ";
   if (inverted != failures_.rend())
-    text << "-lumen_pressure if that cell is at the airway, a finer mesh there, a slower -ventilator_ramp, another "
-            "-tissue; the law may have no equilibrium at this pressure.";
+    text << "-lumen_pressure if that cell is at the airway, a finer mesh there, a slower rise of pressure or flow, "
+            "another -tissue; the law may have no equilibrium at this pressure.";
   else
-    text << "petsc_options/solvers/direct.opts, a smaller -ts_dt, a larger -snes_max_it, a slower -ventilator_ramp; "
-            "-snes_monitor and -ksp_monitor show where it stalls; the law may have no equilibrium at this pressure.";
+    text << "another file of petsc_options/solvers, a smaller -ts_dt, a larger -snes_max_it, a slower rise of pressure "
+            "or "
+            "flow; -snes_monitor and -ksp_monitor show where it stalls; the law may have no equilibrium at this "
+            "pressure.";
   return text.str();
 }
 

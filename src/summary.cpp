@@ -57,6 +57,12 @@ void add_numbers(Json &json, const ClinicalNumbers &n, const std::optional<doubl
   for (const Entry &e : entries(n, frc)) json[e.key] = optional_json(e.value);
 }
 
+/// The same keys for a run without a breath.
+void add_no_numbers(Json &json)
+{
+  for (const Entry &e : entries({}, {})) json[e.key] = nullptr;
+}
+
 /// Gas volume at rest, ml: Phi0 V0 (empty without airflow, where no porosity is given).
 std::optional<double> functional_residual_capacity(const Scene &scene)
 {
@@ -170,7 +176,10 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
     const auto frc = functional_residual_capacity(scene);
     const std::vector<SignalRow> rows = audits.regions.complete(simulation.rows());
     if (scene.facts().ventilator) {
-      add_numbers(json, overall_numbers(rows), frc);
+      if (breath_rows(rows).empty())
+        add_no_numbers(json);
+      else
+        add_numbers(json, overall_numbers(rows), frc);
       json["static_curve"] = static_curve(rows);
       json["breaths"] = Json::array();
       for (const BreathRows &b : breath_rows(rows)) {
@@ -261,8 +270,8 @@ PetscErrorCode write_energy(MPI_Comm comm, const Output &output, const Simulatio
 
 namespace {
 
-/// The balance of the last breath, beside that of its filling.
-PetscErrorCode print_energy(MPI_Comm comm, const EnergyAudit &audit, const BreathRows &breath)
+/// The balance of the last breath (without one: of the run), beside that of its filling.
+PetscErrorCode print_energy(MPI_Comm comm, const EnergyAudit &audit, const BreathRows &breath, const char *span)
 {
   const EnergyBalance whole = audit.rows()[breath.last] - audit.rows()[breath.first],
                       filling = audit.rows()[breath.fullest] - audit.rows()[breath.first];
@@ -271,7 +280,7 @@ PetscErrorCode print_energy(MPI_Comm comm, const EnergyAudit &audit, const Breat
   };
 
   PetscFunctionBeginUser;
-  PetscCall(PetscPrintf(comm, "\n%-30s %12s %12s\n", "Energy", "breath", "to the peak"));
+  PetscCall(PetscPrintf(comm, "\n%-30s %12s %12s\n", "Energy", span, "to the peak"));
   PetscCall(line("ventilator_work", whole.ventilator_work, filling.ventilator_work));
   for (std::size_t i = 0; i < audit.accounts().size(); ++i)
     if (whole.accounts[i] != 0 || filling.accounts[i] != 0)
@@ -305,7 +314,8 @@ PetscErrorCode print_numbers(MPI_Comm comm, const Output &output, const Scene &s
   const BreathRows breath = last_breath(rows);
 
   PetscFunctionBeginUser;
-  if (scene.facts().ventilator) {
+  const bool breathes = !breath_rows(rows).empty();
+  if (breathes) {
     PetscCall(PetscPrintf(comm,
                           "\n%s tissue, %.0f ml at rest: clinical numbers of the last breath (fits over all breaths)\n",
                           scene.tissue().law().name(), (double)(scene.mesh().volume() / units::mm3_per_ml)));
@@ -315,7 +325,7 @@ PetscErrorCode print_numbers(MPI_Comm comm, const Output &output, const Scene &s
       PetscCall(PetscPrintf(comm, "  %-28s %12.4g %s\n", e.label, shown, e.unit));
     }
   }
-  if (audits.energy) PetscCall(print_energy(comm, *audits.energy, breath));
+  if (audits.energy) PetscCall(print_energy(comm, *audits.energy, breath, breathes ? "breath" : "run"));
   if (audits.regions.regions().size() > 1) PetscCall(print_regions(comm, audits.regions, breath));
   PetscCall(PetscPrintf(comm, "\nSmallest J %.4f", (double)simulation.min_J()));
   if (scene.facts().airflow)

@@ -22,7 +22,8 @@ public:
 
   Airway(Model &model, const SceneFacts &facts) : model_(model), facts_(facts) {}
 
-  /// Begins a phase at lung volume @p volume (mm^3 above rest).
+  /// Begins a phase at lung volume @p volume (mm^3 above rest). A ramp of pressure without a start value starts from
+  /// what the ventilator has then.
   void begin_phase(const Phase &phase, PetscReal volume);
   /// Begins an attempt at a step of size @p dt that ends at @p t, s.
   void begin_step(PetscReal t, PetscReal dt);
@@ -37,11 +38,13 @@ public:
   PetscReal change(PetscReal c, PetscReal c_P, PetscReal volume_fixed, PetscReal volume_per_P) const;
   /// Whether the volume of a flow phase was met when close() was called last.
   bool satisfied() const;
-  /// Takes note of an accepted step that ended at @p volume, mm^3.
-  void accept(PetscReal volume)
+  /// Takes note of an accepted step with flow @p flow (mm^3/s) that ended at @p volume, mm^3.
+  void accept(PetscReal volume, PetscReal flow)
   {
     volume_before_ = volume;
     pressure_before_ = pressure_;
+    ventilator_before_ = ventilator_pressure(flow);
+    limited_before_ = limited_;
   }
   /// Pressure at the airway, kPa: what is held, the unknown, or the mean over the free surface.
   PetscErrorCode pressure(Vec local, PetscReal &pressure);
@@ -50,21 +53,29 @@ public:
   {
     return pressure_ + (facts_.tube ? facts_.tube->drop(flow) : 0);
   }
-  /// If the phase has a limit that the ventilator's pressure exceeds: holds the limit from now on and tells so.
+  /// If the phase has a limit that the ventilator's pressure exceeds: holds the limit in the next attempt (and, if that
+  /// is accepted, to the end of the phase) and tells so.
   bool limit(PetscReal flow);
+  /// Whether the volume is held: a prescribed flow of zero.
+  bool holds_volume() const { return control() == Control::flow && phase_.to == 0 && phase_.ramp == 0; }
 
   Mode mode() const { return mode_; }
   /// Flow prescribed in the step at hand, mm^3/s.
   PetscReal flow() const { return (volume_target_ - volume_before_) / dt_; }
 
 private:
+  /// What the phase prescribes: after its limit was reached a pressure.
+  Control control() const { return limited_ ? Control::pressure : phase_.control; }
   void set_mode();
 
   Model &model_;
   const SceneFacts &facts_;
   Phase phase_;
   Mode mode_ = Mode::held;
+  bool limited_ = false, limited_before_ = false;  ///< the limit is held now, was held in the step before
+  bool retake_ = false;                            ///< the next attempt is the first one with the limit held
   PetscReal pressure_ = 0, pressure_before_ = 0;   ///< at the airway now, before the step, kPa
+  PetscReal ventilator_before_ = 0;                ///< at the ventilator before the step, kPa
   PetscReal target_ = 0;                           ///< pressure that the phase prescribes, kPa
   PetscReal volume_begin_ = 0, volume_before_ = 0; ///< at the begin of the phase, of the step, mm^3
   PetscReal volume_target_ = 0, volume_ = 0;       ///< prescribed; at the last close(), mm^3

@@ -232,7 +232,10 @@ struct SceneFacts {
     return airflow && ventilator && ventilator->prescribes_flow() && flow_split == FlowSplit::uniform;
   }
   /// Whether some phase has one pressure of the whole airway (without airflow: of all gas) as an unknown of its own.
-  bool common_pressure() const { return ventilator && (tube || (ventilator->prescribes_flow() && !free_airway())); }
+  bool common_pressure() const
+  {
+    return ventilator && (tube || ventilator->limits_pressure() || (ventilator->prescribes_flow() && !free_airway()));
+  }
 };
 
 /// One physical effect.

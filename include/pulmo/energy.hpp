@@ -46,7 +46,6 @@ public:
   const std::vector<EnergyAccount> &accounts() const { return accounts_; }
   /// Since the start of the run, one entry per row of the signals.
   const std::vector<EnergyBalance> &rows() const { return rows_; }
-  double seconds() const { return seconds_; }
 
 private:
   struct Part { ///< a surface, or the volume
@@ -70,7 +69,6 @@ private:
   std::vector<EnergyBalance> rows_;
   VecHandle before_, rate_, residual_;
   double gas_pressure_ = 0; ///< uniform pressure at the start of the step, kPa
-  double seconds_ = 0;
 };
 
 } // namespace pulmo

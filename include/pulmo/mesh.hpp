@@ -8,6 +8,9 @@
 
 namespace pulmo {
 
+/// Coordinates of a vertex of @p dm or of the middle of an edge.
+PetscErrorCode node_coordinates(DM dm, PetscInt point, PetscReal x[3]);
+
 /// A tetrahedral DMPlex with named surfaces. Coordinates in mm.
 class Mesh {
 public:
@@ -51,7 +54,10 @@ public:
   /// counted along x.
   PetscErrorCode regions(std::vector<Region> &list) const;
   /// Coordinates of a vertex or of the middle of an edge, mm.
-  PetscErrorCode node_coordinates(PetscInt point, PetscReal x[3]) const;
+  PetscErrorCode node_coordinates(PetscInt point, PetscReal x[3]) const
+  {
+    return pulmo::node_coordinates(dm_, point, x);
+  }
 
 private:
   PetscErrorCode check_cells(const Options &options);

@@ -32,7 +32,6 @@ public:
   /// Whether the pressure is held on the surfaces open to the ventilator (so at the start), or free. Held nodes keep
   /// their rows: identity in the Jacobian, zero in the residual that close_rows() leaves.
   void hold_airway(bool held) { airway_held_ = held; }
-  bool airway_held() const { return airway_held_; }
 
   /// Writes the prescribed values of time @p t into a local vector; with @p rate also (value - @p before) / dt.
   PetscErrorCode constrain(PetscReal t, Vec local) const;

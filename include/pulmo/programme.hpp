@@ -25,7 +25,7 @@ struct Phase {
   std::optional<PetscReal> from;  ///< kPa or mm^3/s; not given: what the airway has when the phase begins
   PetscReal to = 0;               ///< kPa or mm^3/s
   PetscReal ramp = 0;             ///< s; 0: @p to holds from the first step on
-  std::optional<PetscReal> limit; ///< of the airway pressure in a flow phase, kPa: reached, it is held to the end
+  std::optional<PetscReal> limit; ///< of the ventilator's pressure in a flow phase, kPa: reached, it is held to the end
 
   /// The controlled quantity at a time of this phase (from must be known if there is a ramp).
   PetscReal value(PetscReal t) const;
@@ -40,6 +40,7 @@ public:
 
   const std::vector<Phase> &phases() const { return phases_; }
   bool prescribes_flow() const;
+  bool limits_pressure() const;
   PetscReal end() const { return phases_.empty() ? 0 : phases_.back().end; }
 
 private:

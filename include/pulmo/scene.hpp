@@ -25,7 +25,6 @@ public:
   const SceneFacts &facts() const { return facts_; }
   const Tissue &tissue() const { return *tissue_; }
   const Airflow &airflow() const { return *airflow_; }
-  const Ventilator &ventilator() const { return *ventilator_; }
   /// Active effects in order of registration.
   std::vector<const Effect *> active() const;
 
@@ -33,9 +32,8 @@ private:
   Mesh mesh_;
   SceneFacts facts_;
   std::vector<std::unique_ptr<Effect>> effects_;
-  Tissue *tissue_; // these three are elements of effects_
+  Tissue *tissue_; // these two are elements of effects_
   Airflow *airflow_;
-  Ventilator *ventilator_;
 };
 
 } // namespace pulmo

@@ -171,7 +171,10 @@ class Supersyringe(unittest.TestCase):
 
 class Programmes(unittest.TestCase):
     def test_pressure_limit(self):
-        """Nothing changes until the limit is reached; then it is held and the flow falls, never above the set one."""
+        """Nothing changes until the limit is reached; then it is held and the flow falls, never above the set one.
+
+        A phase with a limit has one common airway pressure, so that is what it is compared with.
+        """
         def run(limit, options):
             text = f"inspiration 0.6 flow 400 {limit}\npause 0.15 hold\nexpiration 0.2 pressure 0\n"
             return pulmo.finished(pulmo.TIGHT + pulmo.SCENE + pulmo.LITRE + pulmo.QUIET + pulmo.programme(text) +
@@ -181,7 +184,8 @@ class Programmes(unittest.TestCase):
                               ("tube", pulmo.UNIFORM + ["-tube", "-tube_k1", "2", "-tube_k2", "3"])):
             with self.subTest(name):
                 column = ("ventilator" if name == "tube" else "airway") + "_pressure_cmH2O"
-                free, limited = run("", options), run("limit 5", options)
+                common = [] if name == "still" else ["-ventilator_flow_split", "common_pressure"]
+                free, limited = run("", options + common), run("limit 5", options)
                 above = int(np.argmax(free[column] > 5))
                 self.assertGreater(above, 2)
                 self.assertLess(limited[column].max(), 5 + 1e-9)
@@ -196,9 +200,28 @@ class Programmes(unittest.TestCase):
                 pause = np.array([p == "pause" for p in limited["phase"]])
                 np.testing.assert_allclose(limited["volume_ml"][pause], limited["volume_ml"][held][-1], rtol=1e-9)
 
+    def test_without_a_breath(self):
+        """A programme without `inspiration` has no numbers of a breath, but its static curve."""
+        case = pulmo.finished(pulmo.options_file("scenes/programme.opts") + pulmo.DIRECT + pulmo.CUBE +
+                              pulmo.programme("inflation 0.1 flow 0.05\npause 0.1 hold\n"))
+        numbers = case.json()
+        for key in ("peak_inspiratory_pressure_cmH2O", "tidal_volume_ml", "work_j", "compliance_ml_per_cmH2O"):
+            self.assertIsNone(numbers[key], key)
+        self.assertEqual(numbers["breaths"], [])
+        self.assertEqual(len(numbers["static_curve"]), 1)
+        self.assertNotIn("clinical numbers", case.out)
+
+    def test_the_unknown_pressure_needs_the_assembled_jacobian(self):
+        case = pulmo.Case(pulmo.options_file("scenes/vcv.opts") + pulmo.DIRECT + pulmo.CUBE +
+                          ["-ventilator_flow_split", "common_pressure", "-snes_mf_operator"])
+        self.assertNotEqual(case.code, 0)
+        self.assertIn("-snes_mf_operator", case.err)
+        self.assertEqual(case.files(), [])
+
     def test_a_limit_that_is_not_reached_changes_nothing(self):
         text = "inspiration 0.3 flow 300 {}\npause 0.1 hold\n"
-        a, b = (pulmo.finished(pulmo.DIRECT + pulmo.SCENE + pulmo.LITRE + pulmo.QUIET + pulmo.programme(text.format(limit)))
+        a, b = (pulmo.finished(pulmo.DIRECT + pulmo.SCENE + pulmo.LITRE + pulmo.QUIET + pulmo.programme(text.format(limit)) +
+                               ["-ventilator_flow_split", "common_pressure"])
                 for limit in ("", "limit 60"))
         for c in ("time_s", "airway_pressure_cmH2O", "flow_ml_per_s", "volume_ml"):
             np.testing.assert_array_equal(a.signals()[c], b.signals()[c])

@@ -214,6 +214,9 @@ TEST(ProgrammeFile, ErrorsNameFileLineAndMend)
       {"inspiration 1 pressure 5 from 2\n", "'from' is the start of a ramp"},
       {"inspiration 1 pressure 5 limit 20\n", "'limit' does not belong to a pressure phase"},
       {"pause 1 hold 5\n", "'5' does not belong to a hold phase; hold takes nothing more"},
+      {"inspiration 1 pressure 5 ramp 0.1 ramp 0.5\n", "'ramp' is given twice"},
+      {"inspiration 0x1 pressure 5\n", "must be a number, not '0x1'"},
+      {"inspiration 1e-15 pressure 5\n", "must be positive, at least"},
       {"repeat 2\na 1 hold\n", "file:1: this 'repeat' has no 'end'"},
       {"a 1 hold\nend\n", "file:2: 'end' closes no 'repeat'"},
       {"repeat 2\nend\n", "file:1: 'repeat' repeats nothing"},
@@ -227,6 +230,11 @@ TEST(ProgrammeFile, ErrorsNameFileLineAndMend)
     const std::string said = complaint(text);
     EXPECT_NE(said.find(what), std::string::npos) << "'" << text << "' gave: " << said;
   }
+}
+
+TEST(ProgrammeFile, AByteOrderMarkIsSkipped)
+{
+  EXPECT_EQ(parse("\xEF\xBB\xBFpause 1 hold\n")[0].name, "pause");
 }
 
 TEST(ProgrammeFile, RandomTextIsReadOrRefused)

@@ -155,6 +155,9 @@ private:
   PetscErrorCode check_settings(const Options &options) const
   {
     PetscFunctionBeginUser;
+    PulmoUserCheck(mode_ != "supersyringe" || steps_ * breaths_ <= 100000, options.comm(),
+                   "-ventilator_steps %d times -ventilator_breaths %d are more than 100000 steps; lower one",
+                   (int)steps_, (int)breaths_);
     if (mode_ != "pcv" && mode_ != "vcv") PetscFunctionReturn(PETSC_SUCCESS);
     PulmoUserCheck(ramp_ <= inspiration_, options.comm(),
                    "-ventilator_ramp %g s is longer than -ventilator_inspiration %g s; shorten the ramp", (double)ramp_,

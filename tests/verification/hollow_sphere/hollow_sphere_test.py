@@ -118,7 +118,7 @@ class RadialSolver(unittest.TestCase):
         def volume(dt, n, stages=3):
             return 2 * breathe(Shell(), BREATH.steps(dt, 1.0), BREATH, stages, n)["V"][-1]
         best = volume(0.0125, 40)
-        self.assertAlmostEqual(best, 517.4453, delta=1e-4)  # two other codes of the model's notes: 517.4 to 517.8
+        self.assertAlmostEqual(best, 517.4453, delta=1e-4)
         self.assertLess(abs(volume(0.025, 32) / best - 1), 1e-8)  # other steps and other points
         self.assertLess(abs(volume(0.0125, 40, stages=2) / best - 1), 1e-6)  # another method
         steps = np.array([0.05, 0.025, 0.0125, 0.00625])
