@@ -1,14 +1,14 @@
 #!/usr/bin/python3
 """A breath of the whole-lung model as one would write it in FEniCS: the peer of `tools/benchmark breath --peer`.
 
-    peer_fenics.py SCENE.json DIR [PETSc options]
+    peer_fenics.py SCENE.json MESH.msh SOLVER.opts DIR
 
 DOLFINx 0.5 (Debian package python3-dolfinx-real), one rank. P2-P1, backward Euler with the exactly conservative
 (J_new - J_old)/dt, law of Birzle et al. 2019, springs with the full displacement vector, pressure-controlled
 ventilation. Forms, tangent and code come from UFL and FFCx; nothing of pulmo is used. Rows are scaled as in pulmo
 (momentum 1/(modulus h^2), mass dt/h^3), so that -snes_rtol and -snes_atol mean the same.
 
-Reads SCENE.json (mm, s, kPa): mesh, mesh_scale, dt, end, stop (last time that is solved), pressure, ramp, inspiration,
+Reads SCENE.json (mm, s, kPa): mesh_scale, dt, stop (last time that is solved), pressure, ramp, inspiration,
 permeability, springs (surface: kPa/mm), tissue (c, beta, c1, c3, d1, d3). Writes DIR/signals.csv and, at the end,
 DIR/summary.json. Time of compiling the forms is reported apart from the rest.
 """
@@ -20,8 +20,9 @@ from pathlib import Path
 
 import petsc4py
 
-petsc4py.init(["peer_fenics.py"] + sys.argv[3:])
+petsc4py.init(["peer_fenics.py", "-options_file", sys.argv[3]])
 
+import dolfinx
 import gmsh
 import numpy as np
 import ufl
@@ -76,9 +77,9 @@ def modulus(k):
 class Breath:
     """Unknowns, forms and Newton solver."""
 
-    def __init__(self, scene):
+    def __init__(self, scene, path):
         self.scene, self.seconds = scene, {"residual": 0.0, "jacobian": 0.0, "compile": 0.0}
-        self.mesh, facets, surfaces = read_mesh(scene["mesh"], scene["mesh_scale"])
+        self.mesh, facets, surfaces = read_mesh(path, scene["mesh_scale"])
         mesh, k = self.mesh, scene["tissue"]
         missing = [name for name in [*scene["springs"], "airway"] if name not in surfaces]
         if missing:
@@ -105,12 +106,13 @@ class Breath:
         mass = ((J - J_before) * q + scene["dt"] * darcy) * dx
         form = 1 / (modulus(k) * h**2) * momentum + 1 / h**3 * mass
 
-        begin = time.perf_counter()
+        begin, cpu = time.perf_counter(), time.process_time()
         options = {"cffi_extra_compile_args": ["-O3", "-march=native", "-g0"]}
         self.residual_form = fem.form(form, jit_params=options)
         self.jacobian_form = fem.form(ufl.derivative(form, self.state), jit_params=options)
         self.volume_form = fem.form((J - 1) * dx, jit_params=options)
         self.seconds["compile"] = time.perf_counter() - begin
+        self.compile_cpu = time.process_time() - cpu
 
         pressures, _ = W.sub(1).collapse()
         self.airway_pressure = fem.Function(pressures)
@@ -157,10 +159,10 @@ class Breath:
 
 
 def main():
-    begin = time.perf_counter()
-    scene, folder = json.loads(Path(sys.argv[1]).read_text()), Path(sys.argv[2])
+    begin, cpu = time.perf_counter(), time.process_time()
+    scene, folder = json.loads(Path(sys.argv[1]).read_text()), Path(sys.argv[4])
     folder.mkdir(parents=True, exist_ok=True)
-    breath = Breath(scene)
+    breath = Breath(scene, sys.argv[2])
     seconds = breath.seconds
     seconds["setup"] = time.perf_counter() - begin - seconds["compile"]
     newton, steps = 0, round(scene["stop"] / scene["dt"])
@@ -180,7 +182,8 @@ def main():
     seconds["solve"] = seconds["total"] - seconds["setup"] - seconds["residual"] - seconds["jacobian"]
     seconds["output"] = 0.0
     summary = {"finished": True, "steps": steps, "rejected_steps": 0, "newton_iterations": newton,
-               "krylov_iterations": newton, "wall_seconds": seconds, **breath.facts}
+               "krylov_iterations": newton, "wall_seconds": seconds,
+               "cpu_seconds": time.process_time() - cpu - breath.compile_cpu, "dolfinx": dolfinx.__version__, **breath.facts}
     (folder / "summary.json").write_text(json.dumps(summary, indent=1))
 
 
