@@ -1,5 +1,6 @@
 """Bars of seconds by stage and of memory, Krylov iterations over time: one picture for runs side by side."""
 import csv
+import textwrap
 
 import matplotlib
 
@@ -21,8 +22,9 @@ def krylov_of_steps(result):
 
 
 def side_by_side(path, title, entries):
-    """`entries`: (label, seconds by stage, memory in MB, result, failed) of each run."""
+    """`entries`: (label, seconds by stage, memory in MB, result, failed) of each run; numbered as they come."""
     height = 1.6 + 0.42 * len(entries)
+    shades = plt.get_cmap("tab20").colors
     figure, (time, memory, krylov) = plt.subplots(1, 3, figsize=(14, max(3.4, height)), width_ratios=[2, 1, 1.4],
                                                   layout="constrained")
     places = range(len(entries))
@@ -34,12 +36,13 @@ def side_by_side(path, title, entries):
                 left += seconds[stage]
         time.barh(place, seconds["total"] - left, left=left, color="#dddddd")
         time.text(seconds["total"], place, f" {seconds['total']:.3g} s" + (" failed" if failed else ""), va="center", fontsize=8)
-    time.set_yticks(places, [label if len(label) < 60 else label[:57] + "..." for label, *_ in entries], fontsize=8)
+    time.set_yticks(places, [textwrap.fill(f"{i}  {entry[0]}", 70, max_lines=2, placeholder=" ...", break_on_hyphens=False)
+                             for i, entry in enumerate(entries, 1)], fontsize=7)
     time.set_xlabel("wall time (s)")
     time.margins(x=0.15)
     time.legend(fontsize=8)
     memory.barh(places, [entry[2] for entry in entries], color="#6b5b95")
-    memory.set_yticks(places, [""] * len(entries))
+    memory.set_yticks(places, range(1, len(entries) + 1), fontsize=7)
     memory.set_xlabel("peak memory (MB)")
     for place, entry in zip(places, entries):
         memory.text(entry[2], place, f" {entry[2]:.0f}", va="center", fontsize=8)
@@ -47,15 +50,15 @@ def side_by_side(path, title, entries):
     for axis in (time, memory):
         axis.invert_yaxis()
         axis.spines[["top", "right"]].set_visible(False)
-    for place, (label, _, _, result, _) in zip(places, entries):
+    for place, (_, _, _, result, _) in zip(places, entries):
         times, iterations = krylov_of_steps(result)
         if times and max(iterations) > 1:
-            krylov.plot(times, iterations, lw=1, label=label if len(label) < 36 else label[:33] + "...")
+            krylov.plot(times, iterations, lw=1, color=shades[place % len(shades)], label=place + 1)
     krylov.set_xlabel("time (s)")
     krylov.set_ylabel("Krylov per Newton iteration")
     krylov.set_ylim(bottom=0)
     if krylov.lines:
-        krylov.legend(fontsize=6)
+        krylov.legend(fontsize=7, ncols=2)
     figure.suptitle(title, fontsize=10)
     figure.savefig(path, dpi=110)
     plt.close(figure)
