@@ -32,7 +32,7 @@ def side_by_side(path, title, entries):
         left = 0
         for stage, colour in COLOURS.items():
             if stage in seconds:
-                time.barh(place, seconds[stage], left=left, color=colour, label=stage if place == 0 else None)
+                time.barh(place, seconds[stage], left=left, color=colour)
                 left += seconds[stage]
         time.barh(place, seconds["total"] - left, left=left, color="#dddddd")
         time.text(seconds["total"], place, f" {seconds['total']:.3g} s" + (" failed" if failed else ""), va="center", fontsize=8)
@@ -40,7 +40,7 @@ def side_by_side(path, title, entries):
                              for i, entry in enumerate(entries, 1)], fontsize=7)
     time.set_xlabel("wall time (s)")
     time.margins(x=0.15)
-    time.legend(fontsize=8)
+    time.legend([plt.Rectangle((0, 0), 1, 1, color=colour) for colour in COLOURS.values()], COLOURS, fontsize=8)
     memory.barh(places, [entry[2] for entry in entries], color="#6b5b95")
     memory.set_yticks(places, range(1, len(entries) + 1), fontsize=7)
     memory.set_xlabel("peak memory (MB)")

@@ -1,7 +1,8 @@
 """Runs of a program that are measured, kept in a folder each, and not repeated when they are there already.
 
 A run is known by its words and by the content of the files among them (program, mesh, option files): a new build or an
-edited option file is a new run. A run that failed is finished too; one that was interrupted is not.
+edited option file is a new run. A run that failed is finished too; one that was interrupted is not, nor one that was
+ended after less time than it is given now.
 """
 import csv
 import hashlib
@@ -44,6 +45,15 @@ def processes(leader):
     for pid in found:
         found += [child for child, parent in parents.items() if parent == pid]
     return found
+
+
+def end(leader):
+    """Ends a process and those it has started (a launcher's ranks have groups of their own)."""
+    for pid in reversed(processes(leader)):
+        try:
+            os.kill(pid, signal.SIGKILL)
+        except ProcessLookupError:
+            pass
 
 
 def resident_peak(pid):
@@ -98,17 +108,17 @@ def execute(command, folder, ranks, timeout):
                     print(f"\r\033[K    {now - begin:.0f} s: {last_line(folder / 'stdout.log')}", end="", flush=True)
                 if timeout and now - begin > timeout and not late:
                     late = True
-                    os.killpg(process.pid, signal.SIGKILL)
+                    end(process.pid)
                 time.sleep(POLL)
         except BaseException:
-            os.killpg(process.pid, signal.SIGKILL)
+            end(process.pid)
             process.wait()
             raise
         process.returncode = os.waitstatus_to_exitcode(status)
     if tty:
         print("\r\033[K", end="")
     return {"code": process.returncode, "wall": time.monotonic() - begin, "cpu": used.ru_utime + used.ru_stime,
-            "memory": sum(peak.values()), "load": [before, os.getloadavg()[0]],
+            "memory": sum(peak.values()), "ended_after": timeout if late else None, "load": [before, os.getloadavg()[0]],
             "reason": f"no end after {timeout:g} s" if late else
                       reason(folder, process.returncode) if process.returncode else ""}
 
@@ -121,7 +131,10 @@ def measured(command, folder, repeat=0, ranks=1, timeout=None):
     command = [str(word) for word in command]
     place = folder / f"{digest([str(ranks), *command])}_{repeat}"
     kept = place / "result.json"
-    if not kept.exists():
+    result = json.loads(kept.read_text()) if kept.exists() else None
+    if result and result.get("ended_after") and (timeout is None or timeout > result["ended_after"]):
+        result = None
+    if result is None:
         shutil.rmtree(place, ignore_errors=True)
         place.mkdir(parents=True)
         (place / "command.txt").write_text("\n".join(command) + "\n")
@@ -131,7 +144,6 @@ def measured(command, folder, repeat=0, ranks=1, timeout=None):
         part.rename(kept)
         result["kept"] = False
     else:
-        result = json.loads(kept.read_text())
         result["kept"] = True
     for name in ("summary.json", "failure.json"):
         if (place / "run" / name).exists():
