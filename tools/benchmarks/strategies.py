@@ -11,6 +11,7 @@ HEADER = ["flags", "outcome", "steps", "rejected", "Newton", "Krylov", "Krylov/N
 
 
 def arguments(parser):
+    parser.usage = "tools/benchmark strategies SCENE [SCENE ...] [options] -- 'FLAGS' ['FLAGS' ...]"
     parser.add_argument("scene", nargs="+", help="option files of the scene, or names in petsc_options/scenes")
     parser.add_argument("--mesh", type=Path, default=SOURCE / "meshes/lung_test.msh", help="default: meshes/lung_test.msh")
     parser.add_argument("--time", type=float, help="end of the run, s (default: the scene's)")
