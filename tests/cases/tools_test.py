@@ -106,7 +106,7 @@ class Tools(unittest.TestCase):
                                  (["strategies", "nowhere.opts", "--", "@direct"], "nowhere.opts"),
                                  (["strategies", "pcv", "--mesh", "none.msh", "--", "@direct"], "none.msh"),
                                  (["breath", "--time", "0.07"], "multiple"),
-                                 (["breath", "--", "@direct"], "no flags")):
+                                 (["assembly", "--", "@direct"], "no flags")):
             with self.subTest(arguments=arguments):
                 refused = benchmark(*arguments)
                 self.assertNotEqual(refused.returncode, 0)

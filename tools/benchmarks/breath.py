@@ -1,7 +1,7 @@
 """`tools/benchmark breath`: a breath (PCV, Birzle, dt 0.05 s) with each solver file, and by FEniCS on the same mesh.
 
 The peer (--peer) is peer_fenics.py beside this file; it needs Debian's python3-dolfinx-real and is left out, with a
-note, where that is not installed.
+note, where that is not installed. Strings of flags after -- are measured too, as in `strategies`.
 """
 import json
 import statistics
@@ -22,6 +22,7 @@ HEADER = ["solver", "steps", "Newton", "Krylov", *(f"{s} s" for s in runs.STAGES
 
 
 def arguments(parser):
+    parser.usage = "tools/benchmark breath [options] [-- 'FLAGS' ...]"
     parser.add_argument("--mesh", type=Path, default=SOURCE / "meshes/lung_pair.msh", help="default: meshes/lung_pair.msh")
     parser.add_argument("--mesh-scale", type=float, default=1, help="multiplies the coordinates to give mm (default 1)")
     parser.add_argument("--time", type=float, default=3, help="end of the run, s (default 3: the whole breath)")
@@ -98,7 +99,8 @@ def run(options):
         fail("--peer needs the solver direct: the peer is its twin")
     options.output.mkdir(parents=True, exist_ok=True)
     common = ["-dm_plex_filename", options.mesh, "-mesh_scale", f"{options.mesh_scale:g}", "-options_file", SCENES / "pcv.opts"]
-    entries = {name: [*solver_words(f"@{name}"), "-ts_dt", f"{DT:g}", "-ts_max_time", f"{options.time:g}"] for name in names}
+    flags = {name: f"@{name}" for name in names} | {flags: flags for flags in options.flags}
+    entries = {label: [*solver_words(f), "-ts_dt", f"{DT:g}", "-ts_max_time", f"{options.time:g}"] for label, f in flags.items()}
     results = measure(entries, common, options)
     for name, group in results.items():
         if group[0]["code"]:
