@@ -116,7 +116,8 @@ def run(options):
     header, rows, bars, disagree = [*HEADER], [], [], []
     if peers:
         seconds, factor = scaled(runs.stage_seconds(peers), peers[0], results["direct"][0])
-        peer_cpu = seconds["setup"] + factor * (statistics.median(r["cpu"] for r in peers) - seconds["setup"])
+        setup_cpu = statistics.median(r["summary"]["setup_cpu_seconds"] for r in peers)
+        peer_cpu = setup_cpu + factor * (statistics.median(r["cpu"] for r in peers) - setup_cpu)
         peer_memory = max(r["memory"] for r in peers)
         header += ["peer/this wall", "peer/this CPU", "peer/this memory"]
         s = peers[0]["summary"]
