@@ -1,5 +1,6 @@
 #!/usr/bin/python3
-"""The tools beside the program: mesh generator, report, benchmark of assembly."""
+"""The tools beside the program: mesh generator, report, benchmarks."""
+import csv
 import json
 import os
 import subprocess
@@ -11,6 +12,15 @@ import pulmo_case as pulmo
 def tool(name, *arguments):
     command = [os.path.join(pulmo.SOURCE, "tools", name), *map(str, arguments)]
     return subprocess.run(command, env=pulmo.ENVIRONMENT, capture_output=True, text=True, timeout=300)
+
+
+def benchmark(*arguments):
+    return tool("benchmark", "--build", os.path.dirname(pulmo.PROGRAM), *arguments)
+
+
+def table(path):
+    with open(path, newline="") as f:
+        return list(csv.DictReader(f))
 
 
 class Tools(unittest.TestCase):
@@ -52,6 +62,69 @@ class Tools(unittest.TestCase):
                 self.assertLess(result["residual_difference"], 1e-12)
                 self.assertLess(result["jacobian_difference"], 1e-12)
                 self.assertGreater(result["stock_jacobian_us"], 0)
+
+    def test_benchmark_puts_strategies_side_by_side(self):
+        """What the table says is what the runs left; a finished run is kept, a failed one says why."""
+        folder, few = pulmo.scratch(), ["strategies", "pcv", "--mesh", pulmo.mesh("cube_lung.msh"), "--time", "0.1"]
+        strategies = ["@direct", "@iterative -ksp_rtol 1e-3 -blah 3", "@direct -pc_type nonsense"]
+        first = benchmark(*few, "--output", folder, "--", *strategies[:2])
+        self.assertEqual(first.returncode, 0, first.stdout + first.stderr)
+        self.assertNotIn("kept", first.stdout)
+        rows = table(os.path.join(folder, "strategies.csv"))
+        self.assertEqual([row["flags"] for row in rows], strategies[:2])
+        self.assertIn("-blah", rows[1]["remark"])
+        self.assertGreater(float(rows[1]["memory MB"]), 10)
+
+        twin = [pulmo.finished(options + pulmo.PCV + pulmo.CUBE + ["-ts_max_time", "0.1"])
+                for options in (pulmo.DIRECT, pulmo.options_file("solvers/iterative.opts") + ["-ksp_rtol", "1e-3"])]
+        for row, case in zip(rows, twin):
+            summary = case.json()
+            self.assertEqual((int(row["steps"]), int(row["Newton"]), int(row["Krylov"])),
+                             (summary["steps"], summary["newton_iterations"], summary["krylov_iterations"]))
+        volumes = [case.signals()["volume_ml"] for case in twin]
+        difference = max(abs(volumes[1] - volumes[0])) / max(volumes[0])
+        self.assertAlmostEqual(float(rows[1]["volume difference"]) / difference, 1, delta=0.1)
+        with open(os.path.join(folder, "strategies.png"), "rb") as f:
+            self.assertEqual(f.read(8), b"\x89PNG\r\n\x1a\n")
+
+        again = benchmark(*few, "--output", folder, "--", *strategies)
+        self.assertEqual(again.returncode, 0, again.stdout + again.stderr)
+        self.assertEqual(again.stdout.count("kept"), 2)
+        repeated = table(os.path.join(folder, "strategies.csv"))
+        self.assertEqual(repeated[:2], rows)
+        self.assertEqual(repeated[2]["outcome"], "failed")
+        self.assertIn("nonsense", repeated[2]["remark"])
+
+    def test_benchmark_refuses(self):
+        few = ["strategies", "pcv", "--mesh", pulmo.mesh("cube_lung.msh"), "--output", pulmo.scratch()]
+        for arguments, named in ((few, "--"),
+                                 (few + ["--", "@nothing"], "@direct"),
+                                 (few + ["--", "direct"], "@"),
+                                 (few + ["--", "@direct '"], "quotation"),
+                                 (few + ["--", "@direct", "@direct"], "twice"),
+                                 (few + ["--", "@direct -output_dir here"], "-output_dir"),
+                                 (["strategies", "nowhere.opts", "--", "@direct"], "nowhere.opts"),
+                                 (["strategies", "pcv", "--mesh", "none.msh", "--", "@direct"], "none.msh"),
+                                 (["breath", "--time", "0.07"], "multiple"),
+                                 (["assembly", "--", "@direct"], "no flags")):
+            with self.subTest(arguments=arguments):
+                refused = benchmark(*arguments)
+                self.assertNotEqual(refused.returncode, 0)
+                self.assertIn(named, refused.stderr)
+                self.assertNotIn("Traceback", refused.stderr)
+
+    def test_breath_agrees_with_the_peer(self):
+        """All solver files, and FEniCS where it is installed, breathe alike."""
+        folder = pulmo.scratch()
+        breath = benchmark("breath", "--mesh", pulmo.mesh("cube_lung.msh"), "--mesh-scale", "1", "--time", "0.2", "--peer",
+                           "--output", folder)
+        self.assertEqual(breath.returncode, 0, breath.stdout + breath.stderr)
+        rows = table(os.path.join(folder, "breath.csv"))
+        if "left out" not in breath.stdout:
+            self.assertEqual(rows[-1]["solver"], "FEniCS")
+            self.assertEqual(rows[-1]["Newton"], rows[0]["Newton"])
+        for row in rows:
+            self.assertLess(float(row["volume difference"]), 1e-6, row["solver"])
 
 
 if __name__ == "__main__":

@@ -1,0 +1,65 @@
+"""Bars of seconds by stage and of memory, Krylov iterations over time: one picture for runs side by side."""
+import csv
+import textwrap
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+COLOURS = {"setup": "#9a9a9a", "residual": "#e0a83a", "jacobian": "#3b7d4f", "solve": "#2f6c9e", "output": "#b5403a"}
+
+
+def krylov_of_steps(result):
+    """Times and Krylov iterations per Newton step of each time step."""
+    path = result["folder"] / "run/signals.csv"
+    if not path.exists():
+        return [], []
+    with open(path, newline="") as f:
+        rows = [r for r in csv.DictReader(f) if float(r.get("krylov_iterations") or 0) > 0]
+    return ([float(r["time_s"]) for r in rows],
+            [float(r["krylov_iterations"]) / float(r["newton_iterations"]) for r in rows])
+
+
+def side_by_side(path, title, entries):
+    """`entries`: (label, seconds by stage, memory in MB, result, failed) of each run; numbered as they come."""
+    height = 1.6 + 0.42 * len(entries)
+    shades = plt.get_cmap("tab20").colors
+    figure, (time, memory, krylov) = plt.subplots(1, 3, figsize=(14, max(3.4, height)), width_ratios=[2, 1, 1.4],
+                                                  layout="constrained")
+    places = range(len(entries))
+    for place, (_, seconds, _, _, failed) in zip(places, entries):
+        left = 0
+        for stage, colour in COLOURS.items():
+            if stage in seconds:
+                time.barh(place, seconds[stage], left=left, color=colour)
+                left += seconds[stage]
+        time.barh(place, seconds["total"] - left, left=left, color="#dddddd")
+        time.text(seconds["total"], place, f" {seconds['total']:.3g} s" + (" failed" if failed else ""), va="center", fontsize=8)
+    time.set_yticks(places, [textwrap.fill(f"{i}  {entry[0]}", 70, max_lines=2, placeholder=" ...", break_on_hyphens=False)
+                             for i, entry in enumerate(entries, 1)], fontsize=7)
+    time.set_xlabel("wall time (s)")
+    time.margins(x=0.15)
+    time.legend([plt.Rectangle((0, 0), 1, 1, color=colour) for colour in COLOURS.values()], COLOURS, fontsize=8)
+    memory.barh(places, [entry[2] for entry in entries], color="#6b5b95")
+    memory.set_yticks(places, range(1, len(entries) + 1), fontsize=7)
+    memory.set_xlabel("peak memory (MB)")
+    for place, entry in zip(places, entries):
+        memory.text(entry[2], place, f" {entry[2]:.0f}", va="center", fontsize=8)
+    memory.margins(x=0.2)
+    for axis in (time, memory):
+        axis.invert_yaxis()
+        axis.spines[["top", "right"]].set_visible(False)
+    for place, (_, _, _, result, _) in zip(places, entries):
+        times, iterations = krylov_of_steps(result)
+        if times and max(iterations) > 1:
+            krylov.plot(times, iterations, lw=1, color=shades[place % len(shades)], label=place + 1)
+    krylov.set_xlabel("time (s)")
+    krylov.set_ylabel("Krylov per Newton iteration")
+    krylov.set_ylim(bottom=0)
+    if krylov.lines:
+        krylov.legend(fontsize=7, ncols=2)
+    figure.suptitle(title, fontsize=10)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    print(f"wrote {path}")
