@@ -6,6 +6,7 @@
 #include <array>
 #include <cmath>
 #include <cstdio>
+#include <iterator>
 
 namespace pulmo {
 
@@ -385,6 +386,25 @@ PetscErrorCode Mesh::require_surfaces(const std::vector<std::string> &names, con
                    "the mesh %s has no surface '%s', which %s asks for; it has %s: name one of these", file_.c_str(),
                    name.c_str(), option.c_str(), surface_names().c_str());
   }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Mesh::facets(const std::string &name, std::vector<PetscInt> &points) const
+{
+  const Surface &named = surface(name);
+  ISHandle stratum;
+  PetscInt begin, end, n;
+  const PetscInt *all;
+
+  PetscFunctionBeginUser;
+  points.clear();
+  PetscCall(DMPlexGetHeightStratum(dm_, 1, &begin, &end));
+  PetscCall(DMLabelGetStratumIS(named.label, named.value, stratum.out()));
+  if (!stratum) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(ISGetLocalSize(stratum, &n));
+  PetscCall(ISGetIndices(stratum, &all));
+  std::copy_if(all, all + n, std::back_inserter(points), [&](PetscInt p) { return p >= begin && p < end; });
+  PetscCall(ISRestoreIndices(stratum, &all));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -147,12 +147,12 @@ PetscErrorCode Model::create_weak_form()
 /// pressure steered by the ventilator component 4.
 PetscErrorCode Model::find_constraints(std::vector<PetscInt> &constraint_of)
 {
-  PetscInt begin, end, face_begin, face_end;
+  PetscInt begin, end;
   PetscSF sf;
+  std::vector<PetscInt> facets;
 
   PetscFunctionBeginUser;
   PetscCall(DMPlexGetChart(dm_, &begin, &end));
-  PetscCall(DMPlexGetHeightStratum(dm_, 1, &face_begin, &face_end));
   constraint_of.assign(static_cast<std::size_t>(5 * end), -1);
   const auto &constraints = composition().constraints();
   for (std::size_t k = 0; k < constraints.size(); ++k) {
@@ -166,23 +166,13 @@ PetscErrorCode Model::find_constraints(std::vector<PetscInt> &constraint_of)
     };
     for (PetscInt vertex : constraint.vertices) hold(vertex);
     if (constraint.surface.empty()) continue;
-    DMLabel label;
-    ISHandle stratum;
-    PetscCall(DMGetLabel(dm_, constraint.surface.c_str(), &label));
-    PetscCall(DMLabelGetStratumIS(label, mesh_->surface(constraint.surface).value, stratum.out()));
-    if (!stratum) continue;
-    PetscInt n;
-    const PetscInt *points;
-    PetscCall(ISGetLocalSize(stratum, &n));
-    PetscCall(ISGetIndices(stratum, &points));
-    for (PetscInt i = 0; i < n; ++i) {
+    PetscCall(mesh_->facets(constraint.surface, facets));
+    for (PetscInt facet : facets) {
       PetscInt *closure = nullptr, n_closure;
-      if (points[i] < face_begin || points[i] >= face_end) continue;
-      PetscCall(DMPlexGetTransitiveClosure(dm_, points[i], PETSC_TRUE, &n_closure, &closure));
+      PetscCall(DMPlexGetTransitiveClosure(dm_, facet, PETSC_TRUE, &n_closure, &closure));
       for (PetscInt j = 0; j < n_closure; ++j) hold(closure[2 * j]);
-      PetscCall(DMPlexRestoreTransitiveClosure(dm_, points[i], PETSC_TRUE, &n_closure, &closure));
+      PetscCall(DMPlexRestoreTransitiveClosure(dm_, facet, PETSC_TRUE, &n_closure, &closure));
     }
-    PetscCall(ISRestoreIndices(stratum, &points));
   }
   // an edge or vertex of a surface may be on a rank that has none of the surface's facets
   PetscCall(DMGetPointSF(dm_, &sf));
@@ -285,38 +275,28 @@ PetscErrorCode Model::find_airway(const std::vector<PetscInt> &constraint_of)
 {
   const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
   PetscSection section, global;
-  PetscInt begin, end, face_begin, face_end;
+  PetscInt begin, end;
+  std::vector<PetscInt> facets;
 
   PetscFunctionBeginUser;
   PetscCall(DMGetLocalSection(dm_, &section));
   PetscCall(DMGetGlobalSection(dm_, &global)); // made here, used by DMPlexGetPointGlobalField
   PetscCall(DMPlexGetChart(dm_, &begin, &end));
-  PetscCall(DMPlexGetHeightStratum(dm_, 1, &face_begin, &face_end));
   std::map<PetscInt, PetscReal> share; // of each vertex
   std::set<std::string> surfaces;
   for (const Constraint &c : composition().constraints())
     if (c.at_airway) surfaces.insert(c.surface);
   closes_rows_ = !surfaces.empty() || composition().common_gas_pressure();
   for (const std::string &surface : surfaces) {
-    DMLabel label;
-    ISHandle stratum;
-    PetscCall(DMGetLabel(dm_, surface.c_str(), &label));
-    PetscCall(DMLabelGetStratumIS(label, mesh_->surface(surface).value, stratum.out()));
-    if (!stratum) continue;
-    PetscInt n;
-    const PetscInt *points;
-    PetscCall(ISGetLocalSize(stratum, &n));
-    PetscCall(ISGetIndices(stratum, &points));
-    for (PetscInt i = 0; i < n; ++i) {
+    PetscCall(mesh_->facets(surface, facets));
+    for (PetscInt facet : facets) {
       PetscInt *closure = nullptr, n_closure;
       PetscReal area;
-      if (points[i] < face_begin || points[i] >= face_end) continue;
-      PetscCall(DMPlexComputeCellGeometryFVM(dm_, points[i], &area, nullptr, nullptr));
-      PetscCall(DMPlexGetTransitiveClosure(dm_, points[i], PETSC_TRUE, &n_closure, &closure));
+      PetscCall(DMPlexComputeCellGeometryFVM(dm_, facet, &area, nullptr, nullptr));
+      PetscCall(DMPlexGetTransitiveClosure(dm_, facet, PETSC_TRUE, &n_closure, &closure));
       for (PetscInt j = n_closure - 3; j < n_closure; ++j) share[closure[2 * j]] += area / 3; // vertices come last
-      PetscCall(DMPlexRestoreTransitiveClosure(dm_, points[i], PETSC_TRUE, &n_closure, &closure));
+      PetscCall(DMPlexRestoreTransitiveClosure(dm_, facet, PETSC_TRUE, &n_closure, &closure));
     }
-    PetscCall(ISRestoreIndices(stratum, &points));
   }
   for (PetscInt p = begin; p < end && !surfaces.empty(); ++p) {
     PetscInt dof, offset, row, row_end;

@@ -118,26 +118,18 @@ PetscErrorCode Sampling::add_table(const std::vector<PetscReal> &xi, const std::
 
 PetscErrorCode Sampling::surface(const Mesh &mesh, const std::string &name, std::vector<Element> &facets) const
 {
-  DMLabel label;
-  ISHandle stratum;
-  PetscInt cell_begin, face_begin, face_end, n;
-  const PetscInt *points;
+  PetscInt cell_begin;
+  std::vector<PetscInt> points;
 
   PetscFunctionBeginUser;
   facets.clear();
   PetscCall(DMPlexGetHeightStratum(dm_, 0, &cell_begin, nullptr));
-  PetscCall(DMPlexGetHeightStratum(dm_, 1, &face_begin, &face_end));
-  PetscCall(DMGetLabel(dm_, name.c_str(), &label));
-  PetscCall(DMLabelGetStratumIS(label, mesh.surface(name).value, stratum.out()));
-  if (!stratum) PetscFunctionReturn(PETSC_SUCCESS);
-  PetscCall(ISGetLocalSize(stratum, &n));
-  PetscCall(ISGetIndices(stratum, &points));
-  for (PetscInt i = 0; i < n; ++i) {
+  PetscCall(mesh.facets(name, points));
+  for (PetscInt point : points) {
     const PetscInt *support;
     PetscReal area, centre[3], gradients[12], least = PETSC_MAX_REAL;
-    if (points[i] < face_begin || points[i] >= face_end) continue;
-    PetscCall(DMPlexGetSupport(dm_, points[i], &support));
-    PetscCall(DMPlexComputeCellGeometryFVM(dm_, points[i], &area, centre, nullptr));
+    PetscCall(DMPlexGetSupport(dm_, point, &support));
+    PetscCall(DMPlexComputeCellGeometryFVM(dm_, point, &area, centre, nullptr));
     Element e = cells_[support[0] - cell_begin];
     barycentric_gradients(e.inverse, gradients);
     PetscInt opposite = 0;
@@ -155,7 +147,6 @@ PetscErrorCode Sampling::surface(const Mesh &mesh, const std::string &name, std:
     for (int d = 0; d < 3; ++d) e.normal[d] = -g[d] / slope;
     facets.push_back(e);
   }
-  PetscCall(ISRestoreIndices(stratum, &points));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

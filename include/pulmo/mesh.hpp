@@ -45,6 +45,8 @@ public:
   PetscInt cells() const { return cells_; }    ///< on all ranks
   const std::map<std::string, Surface> &surfaces() const { return surfaces_; }
   const Surface &surface(const std::string &name) const { return surfaces_.at(name); }
+  /// The facets of a surface on this rank (mesh points).
+  PetscErrorCode facets(const std::string &name, std::vector<PetscInt> &points) const;
 
   /// User error, naming @p option and the surfaces that exist, unless all @p names are surfaces of the mesh.
   PetscErrorCode require_surfaces(const std::vector<std::string> &names, const std::string &option) const;
