@@ -19,8 +19,8 @@ struct Assembly::Facets {
 /// Where the entries of element matrices go in a sparse matrix. Dofs of one mesh point are neighbours in every
 /// row, and all rows of a mesh point have the same pattern: one offset per pair of mesh points of a cell is enough.
 struct Assembly::MatrixMap {
-  Mat matrix = nullptr; ///< identity only, not owned
-  bool direct = false;  ///< AIJ: entries are added in place
+  PetscObjectId matrix = 0; ///< which matrix: an address may be used again
+  bool direct = false;      ///< AIJ: entries are added in place
   Mat diagonal = nullptr, off_diagonal = nullptr;
   const PetscInt *row_begin[2] = {nullptr, nullptr}; ///< CSR row pointers of the two parts
   PetscScalar *values[2] = {nullptr, nullptr};       ///< their entries, while a Jacobian is assembled
@@ -341,6 +341,7 @@ PetscErrorCode Assembly::jacobian(Part part, PetscReal t, Vec x, Vec x_t, PetscR
 
 PetscErrorCode Assembly::map_matrix(Mat A)
 {
+  PetscObjectId id;
   PetscSection section, global;
   PetscInt point_begin, point_end, n_local, row_begin, row_end;
   PetscBool seq, mpi;
@@ -348,11 +349,12 @@ PetscErrorCode Assembly::map_matrix(Mat A)
   PetscInt n_garray = 0;
 
   PetscFunctionBeginUser;
-  if (map_ && map_->matrix == A) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(PetscObjectGetId((PetscObject)A, &id));
+  if (map_ && map_->matrix == id) PetscFunctionReturn(PETSC_SUCCESS);
   delete map_;
   map_ = new MatrixMap;
   MatrixMap &m = *map_;
-  m.matrix = A;
+  m.matrix = id;
   PetscCall(DMGetLocalSection(dm_, &section));
   PetscCall(DMGetGlobalSection(dm_, &global));
   PetscCall(PetscSectionGetChart(section, &point_begin, &point_end));
