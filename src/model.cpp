@@ -28,7 +28,6 @@ PetscErrorCode Model::build(Composition composition, PetscReal modulus)
   PetscCall(create_fields());
   PetscCall(create_weak_form());
   PetscCall(create_section());
-  PetscCall(attach_rigid_body_modes(dm_));
   PetscDS rate_ds = nullptr;
   if (!own_) {
     PetscCall(create_stock());

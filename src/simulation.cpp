@@ -188,7 +188,7 @@ PetscErrorCode Simulation::create_solver()
   TSAdapt adapt;
   PetscReal max_time;
   PetscInt max_steps;
-  PetscBool own_control, is_beuler, has_pc, is_fieldsplit = PETSC_FALSE;
+  PetscBool own_control, is_beuler, has_pc, is_fieldsplit = PETSC_FALSE, is_lu = PETSC_FALSE;
   char pc_type[64] = "";
 
   PetscFunctionBeginUser;
@@ -197,6 +197,8 @@ PetscErrorCode Simulation::create_solver()
       has_pc, comm,
       "no linear solver: give a solver file, e.g. -options_file petsc_options/solvers/direct.opts (or -pc_type)");
   PetscCall(PetscStrcmp(pc_type, PCFIELDSPLIT, &is_fieldsplit));
+  PetscCall(PetscStrcmp(pc_type, PCLU, &is_lu));
+  if (!is_lu) PetscCall(attach_rigid_body_modes(model_.dm())); // a factorisation has no use for them
 
   PetscCall(TSCreate(comm, ts_.out()));
   PetscCall(TSSetDM(ts_, model_.dm()));
@@ -424,8 +426,7 @@ PetscErrorCode Simulation::border(SNES snes, Vec X, Vec Y)
   Vec F;
   KSP ksp;
   PetscInt iterations;
-  PetscReal P, along_y, along_z;
-  PetscReal here, there;
+  PetscReal P, along_y, along_z, here, there;
 
   PetscFunctionBeginUser;
   if (airway_.mode() != Airway::Mode::common) PetscFunctionReturn(PETSC_SUCCESS);
@@ -648,8 +649,7 @@ std::string Simulation::failure_text() const
             "another -tissue; the law may have no equilibrium at this pressure.";
   else
     text << "another file of petsc_options/solvers, a smaller -ts_dt, a larger -snes_max_it, a slower rise of pressure "
-            "or "
-            "flow; -snes_monitor and -ksp_monitor show where it stalls; the law may have no equilibrium at this "
+            "or flow; -snes_monitor and -ksp_monitor show where it stalls; the law may have no equilibrium at this "
             "pressure.";
   return text.str();
 }

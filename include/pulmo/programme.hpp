@@ -41,7 +41,6 @@ public:
   const std::vector<Phase> &phases() const { return phases_; }
   bool prescribes_flow() const;
   bool limits_pressure() const;
-  PetscReal end() const { return phases_.empty() ? 0 : phases_.back().end; }
 
 private:
   std::vector<Phase> phases_;

@@ -8,7 +8,7 @@ constexpr const char *springs = " -chest_wall -chest_wall_surfaces x0,y1 -chest_
 
 std::string cube(const std::string &mesh)
 {
-  return "-dm_plex_filename " + source("meshes/" + mesh) + " -mesh_scale 1 -tissue yoshihara -pc_type lu ";
+  return "-dm_plex_filename " + source("meshes/" + mesh) + " -mesh_scale 1 -tissue yoshihara -pc_type gamg ";
 }
 
 /// The Jacobian of a scene at rest, step 0.05 s, no gas pressure.
