@@ -2,6 +2,7 @@
 
 #include "pulmo/mesh.hpp"
 #include "pulmo/point.hpp"
+#include "pulmo/single_blocks.hpp"
 
 #include <algorithm>
 #include <array>
@@ -98,6 +99,8 @@ PetscErrorCode make_modes(DM dm, PetscInt, PetscInt field, MatNullSpace *modes)
 struct PMultigrid {
   PC mg = nullptr;
   Mat interpolation = nullptr, coarse = nullptr;
+  Mat single = nullptr; ///< P2 in single precision, if so asked for
+  PetscBool use_single = PETSC_FALSE;
 };
 
 /// The interpolation from P1 to the P2 displacement of @p dm, and the rigid-body modes of P1.
@@ -179,12 +182,14 @@ PetscErrorCode setup_p_multigrid(PC pc)
   const MPI_Comm comm = PetscObjectComm((PetscObject)pc);
   Mat A, B;
   KSP coarse, smoother;
+  PetscInt block_size;
 
   PetscFunctionBeginUser;
   PetscCall(PCGetOperators(pc, &A, &B));
+  PetscCall(MatGetBlockSize(B, &block_size));
   if (!self->mg) {
     DM dm;
-    PetscInt n_fields = 0, rows, fine_rows, block_size;
+    PetscInt n_fields = 0, rows, fine_rows;
     PetscSection global = nullptr;
     const char *prefix;
     MatNullSpace modes;
@@ -198,7 +203,6 @@ PetscErrorCode setup_p_multigrid(PC pc)
     PetscCall(MatGetLocalSize(B, &rows, nullptr));
     PetscCall(PetscSectionGetConstrainedStorageSize(global, &fine_rows));
     PetscCheck(rows == fine_rows, comm, PETSC_ERR_ARG_SIZ, "p_multigrid: the matrix is not that of the displacement");
-    PetscCall(MatGetBlockSize(B, &block_size));
     PetscCall(make_interpolation(dm, block_size, &self->interpolation, &modes));
     PetscCall(MatPtAP(B, self->interpolation, MAT_INITIAL_MATRIX, 1, &self->coarse));
     PetscCall(MatSetNearNullSpace(self->coarse, modes));
@@ -218,6 +222,11 @@ PetscErrorCode setup_p_multigrid(PC pc)
   PetscCall(PCMGGetCoarseSolve(self->mg, &coarse));
   PetscCall(KSPSetOperators(coarse, self->coarse, self->coarse));
   PetscCall(PCMGGetSmoother(self->mg, 1, &smoother));
+  if (self->single)
+    PetscCall(update_single_blocks(self->single, B));
+  else if (self->use_single && block_size == 3)
+    PetscCall(create_single_blocks(B, &self->single));
+  if (self->single) A = B = self->single;
   PetscCall(KSPSetOperators(smoother, A, B));
   PetscCall(PCSetOperators(self->mg, A, B));
   PetscCall(PCSetUp(self->mg));
@@ -239,6 +248,7 @@ PetscErrorCode reset_p_multigrid(PC pc)
   PetscCall(PCDestroy(&self->mg));
   PetscCall(MatDestroy(&self->interpolation));
   PetscCall(MatDestroy(&self->coarse));
+  PetscCall(MatDestroy(&self->single));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -248,6 +258,18 @@ PetscErrorCode destroy_p_multigrid(PC pc)
   PetscCall(reset_p_multigrid(pc));
   delete static_cast<PMultigrid *>(pc->data);
   pc->data = nullptr;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode p_multigrid_options(PC pc, PetscOptionItems *PetscOptionsObject)
+{
+  auto *self = static_cast<PMultigrid *>(pc->data);
+
+  PetscFunctionBeginUser;
+  PetscOptionsHeadBegin(PetscOptionsObject, "p-multigrid");
+  PetscCall(PetscOptionsBool("-pmg_single", "keep the P2 matrix in single precision for the smoother", "",
+                             self->use_single, &self->use_single, nullptr));
+  PetscOptionsHeadEnd();
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -267,6 +289,7 @@ PetscErrorCode create_p_multigrid(PC pc)
   pc->ops->apply = apply_p_multigrid;
   pc->ops->reset = reset_p_multigrid;
   pc->ops->destroy = destroy_p_multigrid;
+  pc->ops->setfromoptions = p_multigrid_options;
   pc->ops->view = view_p_multigrid;
   PetscFunctionReturn(PETSC_SUCCESS);
 }

@@ -78,6 +78,7 @@ PetscErrorCode Run::declare()
   PetscFunctionBeginUser;
   PetscCall(scene_.declare(options_));
   PetscCall(model_.declare(options_));
+  PetscCall(simulation_.declare(options_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <petsc/private/snesimpl.h>
 #include <petsc/private/tsimpl.h>
 #include <sstream>
 
@@ -81,9 +82,9 @@ PetscErrorCode pre_stage(TS ts, PetscReal t)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode initial_guess(SNES, Vec X, void *simulation)
+PetscErrorCode initial_guess(SNES snes, Vec X, void *simulation)
 {
-  return static_cast<Simulation *>(simulation)->guess(X);
+  return static_cast<Simulation *>(simulation)->guess(snes, X);
 }
 
 PetscErrorCode newton_step(SNESLineSearch search, Vec X, Vec Y, PetscBool *changed, void *simulation)
@@ -163,6 +164,14 @@ PetscErrorCode register_step_control()
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode Simulation::declare(Options &options)
+{
+  PetscFunctionBeginUser;
+  PetscCall(predictor_.declare(options));
+  PetscCall(lagging_.declare(options));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode Simulation::setup()
 {
   const DM dm = model_.dm();
@@ -173,6 +182,7 @@ PetscErrorCode Simulation::setup()
   PetscCall(VecDuplicate(local_, rate_.out()));
   PetscCall(VecDuplicate(local_, local_residual_.out()));
   PetscCall(VecDuplicate(local_, before_.out()));
+  PetscCall(predictor_.setup(state_));
   PetscCall(create_solver());
   phases_ = phases();
   end_ = phases_.back().end;
@@ -231,8 +241,8 @@ PetscErrorCode Simulation::create_solver()
   PetscCall(SNESSetComputeInitialGuess(snes, initial_guess, this));
   PetscCall(TSSetFromOptions(ts_));
   PetscCall(offer_fixed_stress(ksp));
-  if (scene_.facts().ventilator && scene_.facts().ventilator->prescribes_flow())
-    PetscCall(SNESSetConvergenceTest(snes, newton_converged, this, nullptr));
+  PetscCall(lagging_.setup(snes));
+  PetscCall(SNESSetConvergenceTest(snes, newton_converged, this, nullptr));
   if (scene_.facts().common_pressure()) {
     SNESLineSearch search;
     PetscBool newton;
@@ -337,6 +347,7 @@ PetscErrorCode Simulation::run(bool &finished)
   PetscFunctionBeginUser;
   PetscCall(PetscTime(&start));
   PetscCall(VecZeroEntries(state_));
+  PetscCall(predictor_.begin(state_));
   PetscCall(DMGlobalToLocal(model_.dm(), state_, INSERT_VALUES, before_));
   PetscCall(model_.measure(before_, measures));
   accepted_ = SignalRow();
@@ -458,11 +469,26 @@ PetscErrorCode Simulation::border(SNES snes, Vec X, Vec Y)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode Simulation::guess(SNES snes, Vec X)
+{
+  PetscFunctionBeginUser;
+  PetscCall(airway_.guess(X));
+  if (!predictor_.in_use()) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(predictor_.improve(
+      snes, [this](Vec d) { return airway_.mode() == Airway::Mode::held ? model_.set_airway_nodes(d, 0) : 0; }, X,
+      start_norm_));
+  inverted_ = false; // a guess was tried, no more
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode Simulation::converged(SNES snes, PetscInt it, PetscReal xnorm, PetscReal ynorm, PetscReal fnorm,
                                      SNESConvergedReason *reason)
 {
   PetscFunctionBeginUser;
   PetscCall(SNESConvergedDefault(snes, it, xnorm, ynorm, fnorm, reason, nullptr));
+  // -snes_rtol is relative to the start of the step, however good the guess
+  if (it == 0 && predictor_.in_use()) snes->ttol = std::max(snes->ttol, snes->rtol * start_norm_);
+  lagging_.judge(snes, it, fnorm);
   if (*reason > 0 && !airway_.satisfied() && extra_newton_++ < max_extra_newton) *reason = SNES_CONVERGED_ITERATING;
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -492,8 +518,15 @@ PetscErrorCode Simulation::after_stage()
   krylov_ += krylov;
   if (reason < 0) {
     PetscReal dt;
+    bool again;
     PetscCall(TSGetTimeStep(ts_, &dt));
-    PetscCall(reject(dt, SNESConvergedReasons[reason], newton, inverted_measures_, inverted_));
+    PetscCall(lagging_.retry(snes, again));
+    if (again) {
+      PetscCall(keep_step(dt));
+    } else {
+      PetscCall(lagging_.settle(snes));
+      PetscCall(reject(dt, SNESConvergedReasons[reason], newton, inverted_measures_, inverted_));
+    }
   }
   inverted_ = false;
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -503,8 +536,11 @@ PetscErrorCode Simulation::accept_stage(Vec X, PetscBool *accept)
 {
   Measures measures;
   PetscReal t, dt;
+  SNES snes;
 
   PetscFunctionBeginUser;
+  PetscCall(TSGetSNES(ts_, &snes));
+  PetscCall(lagging_.settle(snes));
   PetscCall(TSGetTime(ts_, &t));
   PetscCall(TSGetTimeStep(ts_, &dt));
   PetscCall(airway_.apply(X));
@@ -518,12 +554,21 @@ PetscErrorCode Simulation::accept_stage(Vec X, PetscBool *accept)
     PetscCall(airway_.pressure(local_, pressure));
     const PetscReal flow = (measures.volume_change - accepted_.volume * units::mm3_per_ml) / dt;
     if (airway_.limit(flow)) { // the step is taken again, as long as it was: a shorter one would let the flow overshoot
-      TSAdapt adapt;
-      PetscCall(TSGetAdapt(ts_, &adapt));
-      PetscCall(TSSetTimeStep(ts_, dt / adapt->scale_solve_failed));
+      PetscCall(keep_step(dt));
       *accept = PETSC_FALSE;
     }
   }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Lets a step that is taken again be as long as it was, where PETSc would cut it.
+PetscErrorCode Simulation::keep_step(PetscReal dt)
+{
+  TSAdapt adapt;
+
+  PetscFunctionBeginUser;
+  PetscCall(TSGetAdapt(ts_, &adapt));
+  PetscCall(TSSetTimeStep(ts_, dt / adapt->scale_solve_failed));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -564,6 +609,7 @@ PetscErrorCode Simulation::after_step()
 
   // state and consistent flux of the accepted step
   PetscCall(airway_.apply(state_));
+  PetscCall(predictor_.accept(state_));
   PetscCall(DMGlobalToLocal(model_.dm(), state_, INSERT_VALUES, local_));
   PetscCall(model_.constrain(t, local_));
   PetscCall(airway_.pressure(local_, pressure));

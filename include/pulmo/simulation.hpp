@@ -4,7 +4,9 @@
 
 #include "pulmo/airway.hpp"
 #include "pulmo/clinical.hpp"
+#include "pulmo/lagging.hpp"
 #include "pulmo/model.hpp"
+#include "pulmo/predictor.hpp"
 #include "pulmo/scene.hpp"
 
 namespace pulmo {
@@ -46,6 +48,8 @@ public:
       : options_(options), scene_(scene), model_(model), airway_(model, scene.facts())
   {}
 
+  /// Declares the options of the steps.
+  PetscErrorCode declare(Options &options);
   /// Creates TS, SNES, KSP and the matrix from the options database.
   PetscErrorCode setup();
   /// Counts what was done before the run as set-up, s.
@@ -70,7 +74,8 @@ public:
   PetscErrorCode residual(PetscReal t, Vec X, Vec Xdot, Vec F);
   PetscErrorCode jacobian(PetscReal t, Vec X, Vec Xdot, PetscReal shift, Mat A);
   PetscErrorCode before_stage(PetscReal t);
-  PetscErrorCode guess(Vec X) { return airway_.guess(X); }
+  /// First guess of a step; comes as the state before it.
+  PetscErrorCode guess(SNES snes, Vec X);
   /// Completes the Newton step @p Y of a solution @p X whose airway pressure is an unknown: one more right-hand side.
   PetscErrorCode border(SNES snes, Vec X, Vec Y);
   /// PETSc's test, but a prescribed volume must be met too.
@@ -90,6 +95,7 @@ private:
   /// Step size from time @p t, shortened to land on the end of the ramp or of the phase.
   PetscReal landing(PetscReal t) const;
   PetscErrorCode scatter(PetscReal t, Vec X, Vec Xdot);
+  PetscErrorCode keep_step(PetscReal dt);
   /// Notes an attempt that failed; ends the run if the next one would be too short.
   PetscErrorCode reject(PetscReal dt, const std::string &reason, PetscInt newton, const Measures &measures,
                         bool inverted);
@@ -100,6 +106,8 @@ private:
   const Scene &scene_;
   Model &model_;
   Airway airway_;
+  Predictor predictor_;
+  Lagging lagging_;
   std::vector<Observer *> observers_;
   TSHandle ts_;
   MatHandle matrix_;
@@ -113,10 +121,11 @@ private:
   std::vector<SignalRow> rows_;
   PetscReal delivered_ = 0, worst_balance_ = 0, worst_reaction_ = 0, min_J_ = 1;
   PetscInt newton_ = 0, krylov_ = 0, rejected_ = 0;
-  int extra_newton_ = 0;  ///< Newton steps of the attempt at hand for the prescribed volume alone
-  bool inverted_ = false; ///< the attempt at hand met J <= 0
-  bool cut_ = false;      ///< the step at hand was cut
-  int crawled_ = 0;       ///< accepted steps in a row that were tiny
+  PetscReal start_norm_ = 0; ///< residual of the attempt at hand before any Newton step and guess
+  int extra_newton_ = 0;     ///< Newton steps of the attempt at hand for the prescribed volume alone
+  bool inverted_ = false;    ///< the attempt at hand met J <= 0
+  bool cut_ = false;         ///< the step at hand was cut
+  int crawled_ = 0;          ///< accepted steps in a row that were tiny
   Measures inverted_measures_;
   std::vector<FailedAttempt> failures_;
   StageSeconds seconds_;
