@@ -1,4 +1,5 @@
 // What options files can pick: rigid-body modes, p-multigrid, the fixed-stress matrix.
+#include "pulmo/single_blocks.hpp"
 #include "unit/scenes.hpp"
 
 namespace pulmo::test {
@@ -107,6 +108,82 @@ int iterations(const std::string &mesh, const std::string &more)
   EXPECT_EQ(static_cast<int>(solve()), 0);
   EXPECT_GT(reason, 0) << more;
   return static_cast<int>(n);
+}
+
+/// Largest difference of two vectors relative to the largest entry of the first one.
+PetscReal relative_difference(Vec a, Vec b)
+{
+  PetscReal size = 0, difference = 0;
+  VecHandle d;
+  const auto compare = [&]() -> PetscErrorCode {
+    PetscFunctionBeginUser;
+    PetscCall(VecNorm(a, NORM_INFINITY, &size));
+    PetscCall(VecDuplicate(a, d.out()));
+    PetscCall(VecWAXPY(d, -1, a, b));
+    PetscCall(VecNorm(d, NORM_INFINITY, &difference));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  };
+  EXPECT_EQ(static_cast<int>(compare()), 0);
+  return difference / size;
+}
+
+TEST(SingleBlocks, MultiplyAndSmoothAsPetscDoesInDouble)
+{
+  constexpr PetscReal float_precision = 2e-6;
+  const Registry registry = Registry::standard();
+  SceneRun run(registry);
+  MatHandle A, blocks, single;
+  VecHandle x, y, b, expected, result;
+  PULMO_OK(prepare(run, cube("cube.msh") + springs));
+  PULMO_OK(jacobian_at_rest(run, A.out()));
+  PULMO_OK(MatConvert(A, MATBAIJ, MAT_INITIAL_MATRIX, blocks.out()));
+  PULMO_OK(create_single_blocks(A, single.out()));
+  PULMO_OK(MatCreateVecs(A, x.out(), b.out()));
+  for (VecHandle *v : {&y, &expected, &result}) PULMO_OK(VecDuplicate(x, v->out()));
+  PULMO_OK(VecSetRandom(x, nullptr));
+  PULMO_OK(VecSetRandom(b, nullptr));
+
+  PULMO_OK(MatMult(A, x, expected));
+  PULMO_OK(MatMult(single, x, result));
+  EXPECT_LT(relative_difference(expected, result), float_precision);
+  PULMO_OK(MatResidual(A, b, x, expected));
+  PULMO_OK(MatResidual(single, b, x, result));
+  EXPECT_LT(relative_difference(expected, result), float_precision);
+  PULMO_OK(MatGetDiagonal(A, expected));
+  PULMO_OK(MatGetDiagonal(single, result));
+  EXPECT_LT(relative_difference(expected, result), float_precision);
+
+  for (const int direction : {SOR_LOCAL_FORWARD_SWEEP, SOR_LOCAL_BACKWARD_SWEEP, SOR_LOCAL_SYMMETRIC_SWEEP})
+    for (const int from_zero : {0, (int)SOR_ZERO_INITIAL_GUESS})
+      for (const PetscInt sweeps : {1, 3}) {
+        const auto type = static_cast<MatSORType>(direction | from_zero);
+        PULMO_OK(VecCopy(x, expected));
+        PULMO_OK(VecCopy(x, result));
+        PULMO_OK(MatSOR(blocks, b, 1, type, 0, sweeps, 1, expected));
+        PULMO_OK(MatSOR(single, b, 1, type, 0, sweeps, 1, result));
+        EXPECT_LT(relative_difference(expected, result), 10 * float_precision)
+            << "sweep " << direction << ", zero guess " << from_zero << ", times " << sweeps;
+      }
+}
+
+TEST(SingleBlocks, FollowTheMatrix)
+{
+  const Registry registry = Registry::standard();
+  SceneRun run(registry);
+  MatHandle A, single;
+  VecHandle x, expected, result;
+  PULMO_OK(prepare(run, cube("cube_coarse.msh") + springs));
+  PULMO_OK(jacobian_at_rest(run, A.out()));
+  PULMO_OK(create_single_blocks(A, single.out()));
+  PULMO_OK(MatCreateVecs(A, x.out(), expected.out()));
+  PULMO_OK(VecDuplicate(x, result.out()));
+  PULMO_OK(VecSetRandom(x, nullptr));
+  PULMO_OK(MatScale(A, -3));
+  PULMO_OK(MatShift(A, 0.25));
+  PULMO_OK(update_single_blocks(single, A));
+  PULMO_OK(MatMult(A, x, expected));
+  PULMO_OK(MatMult(single, x, result));
+  EXPECT_LT(relative_difference(expected, result), 2e-6);
 }
 
 TEST(PMultigrid, IterationsDoNotGrowWithTheMesh)
