@@ -2,7 +2,7 @@
 import json
 import subprocess
 
-from .common import SOURCE, environment, fail, processor, write_table
+from .common import SOURCE, environment, fail, make_lung, processor, write_table
 
 LAWS = ["berger", "ma", "birzle", "yoshihara", "rausch"]
 
@@ -13,16 +13,6 @@ def arguments(parser):
     parser.add_argument("--laws", nargs="+", default=LAWS, choices=LAWS)
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--no-stock", action="store_true", help="leave out PETSc's integrator (minutes)")
-
-
-def make_lung(cells, build):
-    """Path of a pair of lungs of about `cells` tetrahedra, made by tools/lung_mesh if it is not there yet."""
-    mesh = build / f"lung_pair_{cells}.msh"
-    if not mesh.exists():
-        print(f"making {mesh.name} ...", flush=True)
-        subprocess.run([SOURCE / "tools/lung_mesh", "--side", "both", "--cells", str(cells), "--output", mesh],
-                       check=True, stdout=subprocess.DEVNULL)
-    return mesh
 
 
 def run(options):
