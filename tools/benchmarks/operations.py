@@ -8,7 +8,6 @@ so the program is built once more for x86-64-v3: same source, same vectors of fo
 import re
 import shutil
 import subprocess
-from collections import defaultdict
 from pathlib import Path
 
 from .common import SOURCE, environment, fail
@@ -19,12 +18,12 @@ LANES = {"sd": 1, "pd": 2}
 VECTOR = {"ymm": 2, "zmm": 4}  # times the lanes of xmm
 PLAIN = re.compile(r"^v?(h?add|h?sub|addsub|mul|div|sqrt|max|min)(sd|pd)$")
 FUSED = re.compile(r"^vfn?m(add|sub|addsub|subadd)\d{3}(sd|pd)$")
-# where instructions are executed; the first pattern that is found in the name of the function decides
-GROUPS = {"insertion": r"add_to_matrix|MatZeroEntries|MatSetValues|MatAssembly|MatZeroRows",
-          "element matrices": r"MatrixBuilder|product_(tile|rows)|add_to_vector",
-          "gradients and states": r"PointData|make_point|Places|jacobian_minus_one|invariants",
-          "laws and fluxes": r"Kernels|volume_(residual|jacobian)|facet_(residual|jacobian)|surface_|tissue|exp|log|pow",
-          "rest (gather, scatter, clearing)": r""}
+# where the time goes: the first pattern that is found in the name of a function decides; others are no part of it
+GROUPS = {"insertion into the matrix": r"add_to_matrix|MatZeroEntries|MatZeroRows",
+          "element matrices and vectors": r"MatrixBuilder|product_(tile|rows)|add_to_vector",
+          "gradients and states": r"PointData|make_point|invariants|Places",
+          "laws and fluxes": r"Kernels|volume_(residual|jacobian)|surface_(residual|jacobian)|cofactor|expm1|log1p|_(exp|log|pow)_",
+          "gather, scatter, clearing": r"Assembly::(residual|jacobian|for_blocks)|integrate_(vectors|matrices)|memset"}
 
 
 def flops(mnemonic, operands):
@@ -53,48 +52,68 @@ def disassembled(path):
 
 
 def executed(lines):
-    """Of a callgrind dump: names of the events, and [(object, function, address, costs)] of what a function does itself."""
-    events, entries, place, function, skip = [], [], None, None, False
+    """Of a callgrind dump: names of the events, and [(object, address, costs)] of what functions do themselves."""
+    events, entries, place, skip = [], [], None, False
     for line in lines:
         key, _, value = line.partition("=")
         if line.startswith("events:"):
             events = line.split()[1:]
         elif key == "ob":
             place = value.strip()
-        elif key == "fn":
-            function = value.strip()
         elif key == "calls":
             skip = True  # the next line is what the callee took
         elif line.startswith("0x"):
             if not skip:
                 words = line.split()
                 costs = [int(word) for word in words[2:]] + [0] * (len(events) - len(words) + 2)
-                entries.append((place, function, int(words[0], 16), costs))
+                entries.append((place, int(words[0], 16), costs))
             skip = False
     return events, entries
 
 
 def totals(lines, disassemble=disassembled):
-    """Operations, divisions, instructions and bytes of a dump, and instructions by group."""
+    """Operations, divisions and bytes of a dump."""
     events, entries = executed(lines)
-    objects, sums, groups = {}, defaultdict(float), defaultdict(float)
-    for place, function, address, costs in entries:
+    objects, sums = {}, {"flops": 0, "divisions": 0, "bytes": 0}
+    for place, address, costs in entries:
         if place not in objects:
             objects[place] = disassemble(place) if Path(place or "").is_file() else {}
         cost = dict(zip(events, costs))
         count, divides = objects[place].get(address, (0, False))
         sums["flops"] += count * cost["Ir"]
         sums["divisions"] += divides * cost["Ir"]
-        sums["instructions"] += cost["Ir"]
         sums["bytes"] += 64 * sum(cost.get(event, 0) for event in ("DLmr", "DLmw", "DLdmr", "DLdmw"))
-        groups[next(group for group, pattern in GROUPS.items() if re.search(pattern, function or ""))] += cost["Ir"]
-    return dict(sums, groups=dict(groups))
+    return sums
+
+
+def shares(report):
+    """{group: share of the time} from the text of `perf report -F overhead,symbol`; {} without samples."""
+    found = dict.fromkeys(GROUPS, 0.0)
+    for line in report.splitlines():
+        told = re.match(r"\s*([\d.]+)%\s+\[[.k]\]\s+(.*)", line)
+        group = told and next((group for group, pattern in GROUPS.items() if re.search(pattern, told[2])), None)
+        if group:
+            found[group] += float(told[1])
+    total = sum(found.values())
+    return {group: share / total for group, share in found.items()} if total else {}
+
+
+def time_shares(program, arguments, folder):
+    """`shares` of one run of the benchmark program, sampled by perf; {} where perf is not there or not allowed."""
+    if not shutil.which("perf"):
+        return {}
+    folder.mkdir(parents=True, exist_ok=True)
+    data = folder / "perf.data"
+    command = ["perf", "record", "-e", "cpu-clock", "-F", "2000", "-o", data, program, *arguments, "-benchmark_repeats", "25",
+               "-benchmark_stock", "off"]
+    if subprocess.run([str(c) for c in command], capture_output=True, env=environment()).returncode:
+        return {}
+    return shares(subprocess.run(["perf", "report", "-i", data, "--stdio", "--no-children", "-F", "overhead,symbol"],
+                                 capture_output=True, text=True).stdout)
 
 
 def build(folder):
     """The benchmark program for x86-64-v3 in `folder`."""
-    if not shutil.which("valgrind") or not shutil.which("objdump"):
-        fail("--count needs valgrind and objdump (apt-get install valgrind binutils)")
     print("building for x86-64-v3 ...", flush=True)
     for command in (["cmake", "-S", SOURCE, "-B", folder, "-DCMAKE_BUILD_TYPE=Release", "-DPULMO_NATIVE=OFF", "-DPULMO_TESTS=OFF",
                      "-DCMAKE_CXX_FLAGS=-march=x86-64-v3 -mtune=native"],
