@@ -49,21 +49,38 @@ private:
 /// Four doubles that the compiler keeps in one vector register (or two, or four).
 typedef double Vector4 __attribute__((vector_size(32), aligned(8), may_alias));
 
+inline const Vector4 &four(const double *p)
+{
+  return *reinterpret_cast<const Vector4 *>(p);
+}
+inline Vector4 &four(double *p)
+{
+  return *reinterpret_cast<Vector4 *>(p);
+}
+
+/// out = s[0] G_0 + s[1] G_1 + s[2] G_2 for three rows of @p n doubles, one after the other; n is a multiple of 4.
+inline void combine(PetscInt n, const double s[3], const double *G, double *out)
+{
+  const double s0 = s[0], s1 = s[1], s2 = s[2];
+  for (PetscInt a = 0; a < n; a += 4)
+    four(out + a) = s0 * four(G + a) + s1 * four(G + n + a) + s2 * four(G + 2 * n + a);
+}
+
 /// K[a][b] += sum_r L[r][a] R[r][b]. Rows of L and R have strides @p lda and @p ldb, rows of K @p ldb.
 template <int Rows, int Vectors>
 inline void product_tile(PetscInt rank, const double *L, PetscInt lda, const double *R, PetscInt ldb, double *K)
 {
   Vector4 sum[Rows][Vectors];
   for (int a = 0; a < Rows; ++a)
-    for (int v = 0; v < Vectors; ++v) sum[a][v] = *reinterpret_cast<const Vector4 *>(K + a * ldb + 4 * v);
+    for (int v = 0; v < Vectors; ++v) sum[a][v] = four(K + a * ldb + 4 * v);
   for (PetscInt r = 0; r < rank; ++r) {
     for (int a = 0; a < Rows; ++a) {
       const double l = L[r * lda + a];
-      for (int v = 0; v < Vectors; ++v) sum[a][v] += l * *reinterpret_cast<const Vector4 *>(R + r * ldb + 4 * v);
+      for (int v = 0; v < Vectors; ++v) sum[a][v] += l * four(R + r * ldb + 4 * v);
     }
   }
   for (int a = 0; a < Rows; ++a)
-    for (int v = 0; v < Vectors; ++v) *reinterpret_cast<Vector4 *>(K + a * ldb + 4 * v) = sum[a][v];
+    for (int v = 0; v < Vectors; ++v) four(K + a * ldb + 4 * v) = sum[a][v];
 }
 
 /// The same for any number of rows; @p ldb is a multiple of 4.
@@ -178,11 +195,10 @@ struct PointData {
       const ScalarBasis &basis = fields->basis[f];
       const PetscInt n = basis.stride;
       for (PetscInt q = 0; q < fields->points; ++q) {
-        const PetscScalar *D = basis.derivatives + q * dim * n;
-        PetscScalar *G = gradients[f] + q * dim * n;
-        for (PetscInt d = 0; d < dim; ++d)
-          for (PetscInt a = 0; a < n; ++a)
-            G[d * n + a] = inverse_J[d] * D[a] + inverse_J[dim + d] * D[n + a] + inverse_J[2 * dim + d] * D[2 * n + a];
+        for (PetscInt d = 0; d < dim; ++d) {
+          const PetscReal s[3] = {inverse_J[d], inverse_J[dim + d], inverse_J[2 * dim + d]};
+          combine(n, s, basis.derivatives + q * dim * n, gradients[f] + (q * dim + d) * n);
+        }
       }
     }
     for (PetscInt q = 0; q < fields->points; ++q) {
@@ -380,6 +396,35 @@ struct MatrixBuilder {
     block = scratch.take(widest * widest);
   }
 
+  /// The rows of R of one pair of components, R[r] = w (sum_d g_rd G_d + g_r B).
+  void fill_right(PetscInt trial, PetscInt pair, PetscInt pairs, const PetscScalar *g0, const PetscScalar *g1,
+                  const PetscScalar *g2, const PetscScalar *g3) const
+  {
+    const ScalarBasis &basis = data.fields->basis[trial];
+    const PetscInt n = basis.stride;
+    PetscScalar *r = right;
+    for (PetscInt q = 0; q < data.fields->points; ++q) {
+      const PetscScalar w = data.weights[q], *B = basis.values + q * n, *G = data.gradients[trial] + q * dim * n;
+      const auto row = [&](const PetscScalar *g, const PetscScalar *value) {
+        const PetscScalar v = value ? w * *value : 0;
+        if (g) {
+          const PetscScalar s[3] = {w * g[0], w * g[1], w * g[2]};
+          combine(n, s, G, r);
+          if (value)
+            for (PetscInt b = 0; b < n; b += 4) four(r + b) += v * four(B + b);
+        } else {
+          for (PetscInt b = 0; b < n; b += 4) four(r + b) = v * four(B + b);
+        }
+        r += n;
+      };
+      const PetscInt place = q * pairs + pair;
+      if (g2 || g3)
+        for (PetscInt d = 0; d < dim; ++d)
+          row(g3 ? g3 + (place * dim + d) * dim : nullptr, g2 ? g2 + place * dim + d : nullptr);
+      if (g0 || g1) row(g1 ? g1 + place * dim : nullptr, g0 ? g0 + place : nullptr);
+    }
+  }
+
   void add(PetscInt test, PetscInt trial, const PetscScalar *g0, const PetscScalar *g1, const PetscScalar *g2,
            const PetscScalar *g3, PetscScalar *matrix) const
   {
@@ -401,32 +446,7 @@ struct MatrixBuilder {
     for (PetscInt c = 0; c < Ci; ++c) {
       for (PetscInt e = 0; e < Cj; ++e) {
         const PetscInt pair = c * Cj + e;
-        for (PetscInt q = 0; q < Nq; ++q) {
-          const PetscScalar w = data.weights[q], *B = bj.values + q * nj, *G = data.gradients[trial] + q * dim * nj;
-          PetscScalar *r = right + q * per_point * nj;
-          if (by_gradient) {
-            for (PetscInt d = 0; d < dim; ++d, r += nj) {
-              const PetscScalar v = g2 ? w * g2[(q * Ci * Cj + pair) * dim + d] : 0;
-              if (g3) {
-                const PetscScalar *g = g3 + ((q * Ci * Cj + pair) * dim + d) * dim;
-                const PetscScalar s0 = w * g[0], s1 = w * g[1], s2 = w * g[2];
-                for (PetscInt b = 0; b < nj; ++b) r[b] = s0 * G[b] + s1 * G[nj + b] + s2 * G[2 * nj + b] + v * B[b];
-              } else {
-                for (PetscInt b = 0; b < nj; ++b) r[b] = v * B[b];
-              }
-            }
-          }
-          if (by_value) {
-            const PetscScalar v = g0 ? w * g0[q * Ci * Cj + pair] : 0;
-            if (g1) {
-              const PetscScalar *g = g1 + (q * Ci * Cj + pair) * dim;
-              const PetscScalar s0 = w * g[0], s1 = w * g[1], s2 = w * g[2];
-              for (PetscInt b = 0; b < nj; ++b) r[b] = s0 * G[b] + s1 * G[nj + b] + s2 * G[2 * nj + b] + v * B[b];
-            } else {
-              for (PetscInt b = 0; b < nj; ++b) r[b] = v * B[b];
-            }
-          }
-        }
+        fill_right(trial, pair, Ci * Cj, g0, g1, g2, g3);
         for (PetscInt i = 0; i < bi.nodes * nj; ++i) block[i] = 0;
         product(bi.nodes, rank, left, ni, right, nj, block);
         for (PetscInt a = 0; a < bi.nodes; ++a) {

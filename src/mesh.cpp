@@ -202,6 +202,10 @@ PetscErrorCode Mesh::read(const Options &options, bool ventilated)
 
   // one label per physical name
   PetscCall(PetscOptionsSetValue(nullptr, "-dm_plex_gmsh_use_regions", "true"));
+  // cells that are neighbours in space become neighbours in memory: mesh generators number them at random, and then the
+  // assembly of the matrix mostly waits for it
+  PetscCall(PetscOptionsHasName(nullptr, nullptr, "-dm_plex_reorder", &given));
+  if (!given) PetscCall(PetscOptionsSetValue(nullptr, "-dm_plex_reorder", MATORDERINGRCM));
   PetscCall(DMCreate(comm, dm_.out()));
   PetscCall(DMSetType(dm_, DMPLEX));
   PetscCall(DMSetFromOptions(dm_));

@@ -4,9 +4,15 @@ import csv
 import json
 import os
 import subprocess
+import sys
 import unittest
 
+import numpy as np
+
 import pulmo_case as pulmo
+
+sys.path.insert(0, os.path.join(pulmo.SOURCE, "tools"))
+from benchmarks import assembly, memory, operations, scaling  # noqa: E402
 
 
 def tool(name, *arguments):
@@ -106,12 +112,123 @@ class Tools(unittest.TestCase):
                                  (["strategies", "nowhere.opts", "--", "@direct"], "nowhere.opts"),
                                  (["strategies", "pcv", "--mesh", "none.msh", "--", "@direct"], "none.msh"),
                                  (["breath", "--time", "0.07"], "multiple"),
+                                 (["memory", "--mesh", "none.msh"], "none.msh"),
+                                 (["scaling", "--ranks", "2"], "begin with 1"),
+                                 (["scaling", "--ranks", "1", "--count-ranks"], "several ranks"),
+                                 (["scaling", "--", "@direct", "@iterative"], "one string"),
                                  (["assembly", "--", "@direct"], "no flags")):
             with self.subTest(arguments=arguments):
                 refused = benchmark(*arguments)
                 self.assertNotEqual(refused.returncode, 0)
                 self.assertIn(named, refused.stderr)
                 self.assertNotIn("Traceback", refused.stderr)
+
+    def test_benchmark_measures_memory(self):
+        """One step per entry; shares are of the first entry, and the parts and the rest are the whole."""
+        folder = pulmo.scratch()
+        few = ["memory", "--mesh", pulmo.mesh("cube_lung.msh"), "--output", folder, "--results", os.path.join(folder, "runs")]
+        first = benchmark(*few)
+        self.assertEqual(first.returncode, 0, first.stdout + first.stderr)
+        rows = table(os.path.join(folder, "memory.csv"))
+        self.assertEqual([row["flags"] for row in rows], memory.ENTRIES)
+        for row in rows:
+            peak = float(row["peak MB"])
+            self.assertGreater(peak, 10)
+            self.assertAlmostEqual(sum(float(row[f"{part} MB"]) for part in [*memory.PARTS, "rest"]), peak, delta=2.1)
+            self.assertAlmostEqual(float(row["share of the first"]), peak / float(rows[0]["peak MB"]), delta=0.02)
+        twin = pulmo.finished(pulmo.options_file("solvers/iterative.opts") + pulmo.PCV + pulmo.CUBE + ["-ts_max_time", "0.05"]).json()
+        self.assertEqual((int(rows[1]["dofs"]), int(rows[1]["Newton"])), (twin["dofs"], twin["newton_iterations"]))
+        self.assertEqual(benchmark(*few).stdout.count("kept"), 2)
+
+    def test_memory_log(self):
+        """The last column of PETSc's table, of the first stage; lines that are no events are none."""
+        numbers = " ".join(["1"] * 24)
+        log = f"Event Count Time (sec) Mbytes RMI\n   Max Ratio\n------\nPCSetUp {numbers} 86 11 88 99\nPCSetUp {numbers} 0 0 0 3\n"
+        self.assertEqual(memory.resident_growth(log + f"Object Type\nKSPSolve {numbers} 1 1 1 7\n"), {"PCSetUp": 99})
+        self.assertAlmostEqual(memory.growth_exponent([(8e3, 30), (1e3, 4), (64e3, 480)]), 4 / 3)
+
+    def test_benchmark_scales(self):
+        """A run per mesh and number of ranks; counts are those of the run, and one run on two ranks fits its own model."""
+        folder = pulmo.scratch()
+        few = ["scaling", "--mesh", pulmo.mesh("cube_lung.msh"), "--time", "0.05", "--count-ranks", "--predict-ranks", "2", "4",
+               "--output", folder, "--results", os.path.join(folder, "runs")]
+        first = benchmark(*few)
+        self.assertEqual(first.returncode, 0, first.stdout + first.stderr)
+        one, two = table(os.path.join(folder, "scaling.csv"))
+        twin = pulmo.finished(pulmo.options_file("solvers/iterative.opts") + pulmo.PCV + pulmo.CUBE + ["-ts_max_time", "0.05"]).json()
+        self.assertEqual([int(one[key]) for key in ("dofs", "Newton", "Krylov")],
+                         [twin[key] for key in ("dofs", "newton_iterations", "krylov_iterations")])
+        self.assertEqual((one["ranks"], one["messages/rank/step"], one["efficiency"]), ("1", "0", "1.00"))
+        self.assertGreater(int(two["messages/rank/step"]), 10)
+        with open(os.path.join(folder, "scaling.md")) as f:
+            checks = [line for line in f if "/rank/step |" in line and line.startswith("| cube_lung | 2 |")]
+        self.assertEqual([line.split("|")[-2].strip() for line in checks], ["1.00", "1.00"])
+        self.assertEqual(len(table(os.path.join(folder, "scaling_model.csv"))), 6)
+        self.assertEqual(benchmark(*few).stdout.count("kept"), 2)
+
+    def test_scaling_log(self):
+        """PETSc counts a message at both ends; stages are summed, ranks are not."""
+        log = ("noise\nStage Name,Event Name,Rank,Count,Time,Num Messages,Message Length,Num Reductions,FLOP,dof0\n"
+               "Main Stage,summary,0,9.,20.,300.,7.,8.\nMain Stage,KSPSolve,0,2,1.5,10.,800.,6.,100.,\n"
+               "Main Stage,KSPSolve,1,2,2.5,14.,1000.,6.,300.,\nother,KSPSolve,1,1,1.,2.,8.,0.,0.,\n"
+               "Main Stage,TSStep,0,1,4.,20.,1000.,9.,100.,\nMain Stage,TSStep,1,1,4.,20.,2000.,9.,300.,\n")
+        events = scaling.parse_log(log)
+        self.assertEqual([rank["messages"] for rank in events["KSPSolve"]], [5, 8])
+        self.assertEqual(scaling.mean(events, "KSPSolve", "bytes"), (400 + 504) / 2)
+        self.assertEqual(scaling.mean(events, "absent", "bytes"), 0)
+        self.assertEqual(scaling.imbalance(events), 1.5)
+        newton, krylov = scaling.split(events, {"newton_iterations": 3, "krylov_iterations": 13})
+        self.assertAlmostEqual(krylov["messages"], 0.5)
+        self.assertAlmostEqual(newton["messages"], 3.5 / 3)
+        self.assertEqual(scaling.parse_log("no log"), {})
+
+    def test_scaling_model(self):
+        """The model by hand; and parts of a row of cubes of six tetrahedra, whose cut is known."""
+        lines = scaling.fit([{"neighbours": n, "faces": 10 * n, "newton": {"messages": 2 + 3 * n, "bytes": 50 * n, "reductions": 7},
+                              "krylov": {"messages": 4 * n, "bytes": 1 + 20 * n, "reductions": 2}} for n in (1, 2, 5)])
+        np.testing.assert_allclose(lines["newton"]["messages"] + lines["krylov"]["bytes"], [2, 3, 1, 2], rtol=1e-12)
+        model = {which: dict(lines[which], seconds=seconds) for which, seconds in (("newton", 1e-4), ("krylov", 1e-5))}
+        model.update(newton_per_step=3, krylov_per_step=30)
+        cut = {"faces": 100, "neighbours": 6, "imbalance": 1.1}
+        parts = scaling.predict(model, 8000, 8, cut, 1e-6, 1e8)
+        expected = {"computing": 1000 * 1.1 * (3e-4 + 3e-4), "surfaces": (3 * 500 + 30 * 201) / 1e8,
+                    "latency": (3 * 20 + 30 * 24) * 1e-6, "reductions": (3 * 7 + 30 * 2) * 2e-6 * 3}
+        for name, value in expected.items():
+            self.assertAlmostEqual(parts[name] / value, 1, places=9, msg=name)
+        alone = scaling.predict(model, 8000, 1, scaling.surfaces(None, None, 1), 1e-6, 1e8)
+        self.assertAlmostEqual(sum(alone.values()), 8000 * 6e-4)
+        self.assertAlmostEqual(scaling.scaled_cut(cut, 8e6, 8, 1e6)["faces"], 400)
+
+        corner = [(0, 1, 3, 7), (0, 1, 5, 7), (0, 2, 3, 7), (0, 2, 6, 7), (0, 4, 5, 7), (0, 4, 6, 7)]  # a cube by its bits
+        node = [[4 * (cube + (n & 1)) + (n >> 1) for n in range(8)] for cube in range(12)]
+        tets = np.array([[node[cube][n] for n in tet] for cube in range(12) for tet in corner])
+        pairs = scaling.face_pairs(tets)
+        self.assertEqual(len(pairs), 6 * 12 + 2 * 11)  # inside each cube, and between two
+        self.assertEqual(scaling.surfaces(tets, pairs, 2), {"faces": 2, "neighbours": 1, "imbalance": 1})
+
+    def test_operations_are_counted(self):
+        for mnemonic, operands, expected in (("vfmadd231pd", "%ymm1,%ymm2,%ymm3", (8, False)), ("vfnmadd213sd", "(%rax),%xmm1,%xmm2", (2, False)),
+                                             ("vaddpd", "%xmm1,%xmm2,%xmm3", (2, False)), ("vdivpd", "%ymm1,%ymm2,%ymm3", (4, True)),
+                                             ("mulsd", "%xmm1,%xmm2", (1, False)), ("vsqrtsd", "%xmm1,%xmm2,%xmm3", (1, True)),
+                                             ("vmovapd", "%ymm1,%ymm2", (0, False)), ("vaddps", "%ymm1,%ymm2,%ymm3", (0, False))):
+            with self.subTest(mnemonic=mnemonic):
+                self.assertEqual(operations.flops(mnemonic, operands), expected)
+        dump = ["events: Ir DLmr DLmw DLdmr DLdmw\n", f"ob={__file__}\n", "fn=kernel\n", "0x10 0 5 1 0 0 0\n", "0x14 0 3\n",
+                "calls=2 0x10 0\n", "0x18 0 1000 9 9 9 9\n", "0x1c 0 1 0 1 1 1\n"]
+        self.assertEqual(operations.totals(dump, lambda path: {0x10: (8, False), 0x14: (4, True)}),
+                         {"flops": 52, "divisions": 3, "bytes": 4 * 64})
+        row = assembly.roofline(20, {"flops": 120e3, "divisions": 40, "bytes": 30e3}, {"gflops": 60, "triad_gb": 10})
+        self.assertEqual(dict(zip(assembly.ROOFLINE[2:], row))["attainable µs"], "3.00")
+        self.assertEqual(row[-2:], ["6.7", "6.0"])
+        found = operations.shares(" 30.00%  [.] pulmo::Assembly::add_to_matrix\n 10.00%  [.] product_tile<5, 3>\n  5.00%  [k] idle\n")
+        self.assertAlmostEqual(found["insertion into the matrix"], 0.75)
+
+    def test_machine_is_measured(self):
+        program = os.path.join(os.path.dirname(pulmo.PROGRAM), "pulmo_machine_benchmark")
+        told = assembly.measure([program, "8"])
+        self.assertEqual((told["ranks"], told["array_mb"]), (1, 8))
+        for key in ("gflops", "triad_gb", "read_gb"):
+            self.assertGreater(told[key], 0)
 
     def test_breath_agrees_with_the_peer(self):
         """All solver files, and FEniCS where it is installed, breathe alike."""

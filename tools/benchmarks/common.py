@@ -39,20 +39,44 @@ def environment():
                 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM="1")
 
 
-def write_table(folder, name, title, header, rows, notes):
-    """Prints a table and writes it to a folder as CSV and Markdown."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / f"{name}.csv", "w", newline="") as f:
+def make_lung(cells, build):
+    """Path of a pair of lungs of about `cells` tetrahedra, made by tools/lung_mesh if it is not there yet."""
+    mesh = build / f"lung_pair_{cells}.msh"
+    if not mesh.exists():
+        print(f"making {mesh.name} ...", flush=True)
+        subprocess.run([SOURCE / "tools/lung_mesh", "--side", "both", "--cells", str(cells), "--output", mesh],
+                       check=True, stdout=subprocess.DEVNULL)
+    return mesh
+
+
+def markdown(header, rows):
+    """Lines of a table in Markdown."""
+    texts = [[str(v).replace("|", "/") for v in row] for row in [header, ["---"] * len(header), *rows]]
+    return ["| " + " | ".join(row) + " |" for row in texts]
+
+
+def write_csv(path, header, rows):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "w", newline="") as f:
         csv.writer(f).writerows([header, *rows])
+    print(f"wrote {path}")
+
+
+def show(header, rows):
+    """Prints a table with the columns aligned."""
     texts = [[str(v) for v in row] for row in [header, *rows]]
     widths = [max(3, *(len(text[i]) for text in texts)) for i in range(len(header))]
-    texts.insert(1, ["-" * 3] * len(header))
-    lines = [f"# {title}", "", notes, ""]
-    lines += ["| " + " | ".join(text.replace("|", "/") for text in row) + " |" for row in texts]
-    (folder / f"{name}.md").write_text("\n".join(lines) + "\n")
-    texts[1] = ["-" * w for w in widths]
-    print("\n" + notes + "\n")
+    texts.insert(1, ["-" * w for w in widths])
     for row in texts:
         print("  ".join(text.ljust(w) if i == 0 else text.rjust(w)
                         for i, (text, w) in enumerate(zip(row, widths))).rstrip())
-    print(f"\nwrote {folder / name}.csv and .md")
+
+
+def write_table(folder, name, title, header, rows, notes, more=()):
+    """Prints a table and writes it to a folder as CSV and Markdown; `more`: lines that follow it in the latter."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{name}.md").write_text("\n".join([f"# {title}", "", notes, "", *markdown(header, rows), *more]) + "\n")
+    print("\n" + notes + "\n")
+    show(header, rows)
+    print(f"\nwrote {folder / name}.md")
+    write_csv(folder / f"{name}.csv", header, rows)
