@@ -1,6 +1,7 @@
 #include "pulmo/assembly.hpp"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <numeric>
 
@@ -525,27 +526,36 @@ PetscErrorCode Assembly::add_to_matrix(PetscInt cell, const PetscScalar *matrix,
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-/// Grad u at sample point @p q of cell @p c from the cell's displacements.
-static void sample_gradient(const PetscReal *D, const PetscReal *inverse, PetscInt nodes, const PetscScalar *u,
+/// Displacements of the nodes of a cell, each padded to the four doubles of a vector register.
+using NodeDisplacements = std::array<PetscScalar[4], 32>;
+
+static void gather_displacements(const PetscInt *dofs, PetscInt nodes, const PetscScalar *x, NodeDisplacements &u)
+{
+  for (PetscInt a = 0; a < nodes; ++a)
+    for (int i = 0; i < 4; ++i) u[a][i] = i < 3 ? x[dofs[3 * a + i]] : 0;
+}
+
+/// Grad u at a sample point, with @p D the derivatives of the basis there, from the cell's displacements.
+static void sample_gradient(const PetscReal *D, const PetscReal *inverse, PetscInt nodes, const NodeDisplacements &u,
                             PetscScalar H[9])
 {
-  PetscScalar A[9] = {0};
+  PetscScalar A[3][4] = {}; // [derivative][component]
   for (PetscInt a = 0; a < nodes; ++a)
-    for (int i = 0; i < 3; ++i)
-      for (int g = 0; g < 3; ++g) A[3 * i + g] += u[3 * a + i] * D[3 * a + g];
+    for (int g = 0; g < 3; ++g)
+      for (int i = 0; i < 4; ++i) A[g][i] += D[3 * a + g] * u[a][i];
   for (int i = 0; i < 3; ++i)
     for (int d = 0; d < 3; ++d)
-      H[3 * i + d] = A[3 * i] * inverse[d] + A[3 * i + 1] * inverse[3 + d] + A[3 * i + 2] * inverse[6 + d];
+      H[3 * i + d] = A[0][i] * inverse[d] + A[1][i] * inverse[3 + d] + A[2][i] * inverse[6 + d];
 }
 
 void Assembly::point_states(PetscInt c, const PetscScalar *x, std::vector<PointState> &states) const
 {
-  std::vector<PetscScalar> u(3 * nodes_);
+  NodeDisplacements u;
   states.resize(sample_points_);
-  for (PetscInt i = 0; i < 3 * nodes_; ++i) u[i] = x[cell_dofs(c)[i]];
+  gather_displacements(cell_dofs(c), nodes_, x, u);
   for (PetscInt q = 0; q < sample_points_; ++q) {
     PetscScalar H[9];
-    sample_gradient(&sample_gradients_[q * nodes_ * 3], &invJ_[9 * c], nodes_, u.data(), H);
+    sample_gradient(&sample_gradients_[q * nodes_ * 3], &invJ_[9 * c], nodes_, u, H);
     make_point_state(H, nullptr, states[q]);
   }
 }
@@ -565,9 +575,8 @@ PetscErrorCode Assembly::measure(Vec x, Measures &measures) const
   PetscCallMPI(MPI_Comm_rank(comm, &least.rank));
   const ReadArray xs(x);
   for (PetscInt c = 0; c < cells_; ++c) {
-    const PetscInt *dofs = cell_dofs(c);
-    PetscScalar u[3 * 32];
-    for (PetscInt i = 0; i < 3 * nodes_; ++i) u[i] = xs[dofs[i]];
+    NodeDisplacements u;
+    gather_displacements(cell_dofs(c), nodes_, xs.data(), u);
     double sum = 0;
     for (PetscInt q = 0; q < sample_points_; ++q) {
       PetscScalar H[9];
@@ -609,12 +618,9 @@ PetscErrorCode Assembly::volume_derivative(Vec x, Vec y, PetscReal &derivative) 
   const ReadArray xs(x), ys(y);
   derivative = 0;
   for (PetscInt c = 0; c < cells_; ++c) {
-    const PetscInt *dofs = cell_dofs(c);
-    PetscScalar u[3 * 32], v[3 * 32];
-    for (PetscInt i = 0; i < 3 * nodes_; ++i) {
-      u[i] = xs[dofs[i]];
-      v[i] = ys[dofs[i]];
-    }
+    NodeDisplacements u, v;
+    gather_displacements(cell_dofs(c), nodes_, xs.data(), u);
+    gather_displacements(cell_dofs(c), nodes_, ys.data(), v);
     PetscReal sum = 0;
     for (std::size_t q = 0; q < sample_weights_.size(); ++q) {
       PetscScalar H[9], G[9], cof_F[9];

@@ -18,6 +18,7 @@ namespace {
 constexpr PetscInt dim = 3;
 constexpr PetscInt max_fields = 4;
 constexpr PetscInt max_components = 3;
+constexpr PetscInt max_nodes = 32;
 
 // ------------------------------------------------------------------------------------------------ small arrays
 
@@ -138,6 +139,7 @@ PetscErrorCode make_fields(PetscDS ds, PetscTabulation *T, PetscInt replica, Scr
     ScalarBasis &basis = fields.basis[f];
     const PetscInt Nc = T[f]->Nc, Nb = T[f]->Nb, Np = T[f]->Np;
     PetscCheck(Np == fields.points, PETSC_COMM_SELF, PETSC_ERR_ARG_INCOMP, "fields differ in their quadrature");
+    PetscCheck(Nb / Nc <= max_nodes, PETSC_COMM_SELF, PETSC_ERR_SUP, "more than %d nodes", (int)max_nodes);
     PetscCheck(Nc <= max_components, PETSC_COMM_SELF, PETSC_ERR_SUP, "more than %d components", (int)max_components);
     basis.components = Nc;
     basis.nodes = Nb / Nc;
@@ -164,10 +166,10 @@ PetscErrorCode make_fields(PetscDS ds, PetscTabulation *T, PetscInt replica, Scr
 /// Everything that callbacks read at the points of one cell or face.
 struct PointData {
   const Fields *fields;
-  PetscScalar *gradients[max_fields]; ///< [point][dim][stride], real space
-  PetscScalar *u, *u_t, *u_x;         ///< [point][...] with the offsets of Fields
-  PetscScalar *weights;               ///< quadrature weight times det J
-  PetscReal *x, *normals;             ///< [point][3]
+  PetscScalar *gradients[max_fields];  ///< [point][dim][stride], real space
+  PetscScalar *u, *u_t, *u_x, *rate_x; ///< [point][...] with the offsets of Fields; rate_x: gradients of u_t
+  PetscScalar *weights;                ///< quadrature weight times det J
+  PetscReal *x, *normals;              ///< [point][3]
   std::vector<PointState> states;
 
   PointData(const Fields &f, Scratch &scratch) : fields(&f), states(static_cast<std::size_t>(f.points))
@@ -176,6 +178,7 @@ struct PointData {
     u = scratch.take(f.points * f.total_components);
     u_t = scratch.take(f.points * f.total_components);
     u_x = scratch.take(f.points * f.total_components * dim);
+    rate_x = scratch.take(f.points * f.total_components * dim);
     weights = scratch.take(f.points);
     x = scratch.take(f.points * dim);
     normals = scratch.take(f.points * dim);
@@ -184,7 +187,7 @@ struct PointData {
   {
     std::size_t size = Scratch::padded(f.points) + 2 * Scratch::padded(f.points * dim);
     for (PetscInt i = 0; i < f.n; ++i) size += Scratch::padded(f.points * dim * f.basis[i].stride);
-    return size + 3 * Scratch::padded(f.points * f.total_components * dim);
+    return size + 4 * Scratch::padded(f.points * f.total_components * dim);
   }
 
   /// Gradients in real space, field values, rates and kinematic states from the element's coefficients.
@@ -201,35 +204,36 @@ struct PointData {
         }
       }
     }
+    for (PetscInt f = 0; f < fields->n; ++f) {
+      interpolate(f, coefficients, u, u_x);
+      if (coefficients_t) interpolate(f, coefficients_t, u_t, rate_x);
+    }
     for (PetscInt q = 0; q < fields->points; ++q) {
-      PetscScalar rate_x[9];
-      for (PetscInt f = 0; f < fields->n; ++f) {
-        const ScalarBasis &basis = fields->basis[f];
-        const PetscInt n = basis.stride, C = basis.components;
-        const PetscScalar *B = basis.values + q * n, *G = gradients[f] + q * dim * n;
-        for (PetscInt c = 0; c < C; ++c) {
-          const PetscScalar *e = coefficients + basis.offset + c;
-          PetscScalar s = 0, s_t = 0, g[3] = {0, 0, 0}, g_t[3] = {0, 0, 0};
-          for (PetscInt a = 0; a < basis.nodes; ++a) {
-            s += B[a] * e[a * C];
-            for (PetscInt d = 0; d < dim; ++d) g[d] += G[d * n + a] * e[a * C];
-          }
-          if (coefficients_t) {
-            const PetscScalar *e_t = coefficients_t + basis.offset + c;
-            for (PetscInt a = 0; a < basis.nodes; ++a) {
-              s_t += B[a] * e_t[a * C];
-              for (PetscInt d = 0; d < dim; ++d) g_t[d] += G[d * n + a] * e_t[a * C];
-            }
-          }
-          u[q * Nc + fields->uOff[f] + c] = s;
-          u_t[q * Nc + fields->uOff[f] + c] = s_t;
-          for (PetscInt d = 0; d < dim; ++d) {
-            u_x[q * Nc * dim + fields->uOff_x[f] + c * dim + d] = g[d];
-            if (f == displacement) rate_x[c * dim + d] = g_t[d];
-          }
-        }
+      const PetscInt offset = q * Nc * dim + fields->uOff_x[displacement];
+      make_point_state(u_x + offset, rate_x + offset, states[q]);
+    }
+  }
+
+private:
+  /// Values and gradients of field @p f at all points, the components of a node in one vector.
+  void interpolate(PetscInt f, const PetscScalar coefficients[], PetscScalar *values, PetscScalar *values_x) const
+  {
+    const ScalarBasis &basis = fields->basis[f];
+    const PetscInt n = basis.stride, C = basis.components, Nc = fields->total_components;
+    Vector4 node[max_nodes];
+    for (PetscInt a = 0; a < basis.nodes; ++a)
+      for (PetscInt c = 0; c < 4; ++c) node[a][c] = c < C ? coefficients[basis.offset + a * C + c] : 0;
+    for (PetscInt q = 0; q < fields->points; ++q) {
+      const PetscScalar *B = basis.values + q * n, *G = gradients[f] + q * dim * n;
+      Vector4 s = {0, 0, 0, 0}, s_x[dim] = {s, s, s};
+      for (PetscInt a = 0; a < basis.nodes; ++a) {
+        s += B[a] * node[a];
+        for (PetscInt d = 0; d < dim; ++d) s_x[d] += G[d * n + a] * node[a];
       }
-      make_point_state(u_x + q * Nc * dim + fields->uOff_x[displacement], rate_x, states[q]);
+      for (PetscInt c = 0; c < C; ++c) {
+        values[q * Nc + fields->uOff[f] + c] = s[c];
+        for (PetscInt d = 0; d < dim; ++d) values_x[q * Nc * dim + fields->uOff_x[f] + c * dim + d] = s_x[d][c];
+      }
     }
   }
 };
