@@ -1,6 +1,7 @@
 #include "pulmo/preconditioning.hpp"
 
 #include "pulmo/mesh.hpp"
+#include "pulmo/pattern.hpp"
 #include "pulmo/point.hpp"
 
 #include <algorithm>
@@ -315,7 +316,7 @@ PetscErrorCode FixedStress::setup(DM dm)
   PetscFunctionBeginUser;
   dm_ = dm;
   PetscCall(DMCreateSubDM(dm, 1, &field, is.out(), sub.out()));
-  PetscCall(DMCreateMatrix(sub, matrix_.out()));
+  PetscCall(create_matrix(sub, matrix_.out()));
   PetscCall(DMGetLocalSection(sub, &section));
   PetscCall(DMGetGlobalSection(sub, &global));
   PetscCall(PetscSectionGetChart(section, &begin, &end));
