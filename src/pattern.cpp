@@ -9,8 +9,6 @@ namespace pulmo {
 
 namespace {
 
-using SFHandle = Handle<PetscSF, PetscSFDestroy>;
-
 /// Lists of numbers one behind the other: list i is [begin[i], begin[i + 1]).
 struct Lists {
   std::vector<PetscInt> begin{0}, entries;

@@ -33,10 +33,10 @@ public:
     PetscReal x[3] = {0, 0, 0}; ///< mm
   };
 
-  /// Declares -mesh_scale; the file name is PETSc's -dm_plex_filename.
+  /// Declares -mesh_scale and -mesh_renumber; the file name is PETSc's -dm_plex_filename.
   PetscErrorCode declare(Options &options);
-  /// Reads -dm_plex_filename, scales, distributes and checks it. @p ventilated: the scene is a lung, so a volume
-  /// outside what any lung has betrays the wrong unit.
+  /// Reads -dm_plex_filename, distributes, renumbers, scales and checks it. @p ventilated: the scene is a lung, so a
+  /// volume outside what any lung has betrays the wrong unit.
   PetscErrorCode read(const Options &options, bool ventilated);
 
   DM dm() const { return dm_; }
@@ -70,7 +70,7 @@ private:
   DMHandle dm_;
   std::string file_;
   PetscReal scale_ = 1, volume_ = 0, length_ = 0;
-  bool scale_given_ = false;
+  bool scale_given_ = false, renumber_ = true;
   PetscInt cells_ = 0;
   std::map<std::string, Surface> surfaces_;
   std::vector<std::string> inside_; ///< names of facets inside the volume: no boundary
