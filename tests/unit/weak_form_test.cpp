@@ -227,7 +227,7 @@ struct BlockNorm {
 /// Compares every column of the Jacobian with central differences of the residual, block by block.
 void expect_jacobian(Run &run, State &s, PetscReal shift, double tolerance)
 {
-  constexpr double h = 1e-5;
+  constexpr double h = 5e-6;
   MatHandle A;
   VecHandle d, up, down;
   std::vector<PetscInt> fields, points;
