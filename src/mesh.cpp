@@ -612,12 +612,12 @@ PetscErrorCode Mesh::pin_body(const std::vector<PetscInt> &vertices, std::vector
   using Coordinates = std::array<PetscReal, 3>;
   constexpr PetscReal off_axis = 3; // weight of what leads away from an axis
   const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
-  PetscMPIInt rank;
+  PetscMPIInt size;
   std::array<Coordinates, 3> chosen{};
   int along = 2, across = 0; // the axis that AB is close to; the second axis of the plane that ABC is close to
 
   PetscFunctionBeginUser;
-  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  PetscCallMPI(MPI_Comm_size(comm, &size));
   // A: the lowest vertex. B: far from A and close to an axis through A. C: far from AB and close to a plane of two
   // axes through it. Then the held components hardly turn a lung that swells. Ranks that share a vertex have the same
   // coordinates for it, so the choice by coordinates is the same on all.
@@ -630,27 +630,22 @@ PetscErrorCode Mesh::pin_body(const std::vector<PetscInt> &vertices, std::vector
     return axis == along ? -PETSC_MAX_REAL : d[axis] - off_axis * d[3 - along - axis];
   };
   for (int k = 0; k < 3; ++k) {
-    struct {
-      double score;
-      int rank;
-    } best{-PETSC_MAX_REAL, rank}, winner;
-    double found[4] = {0, 0, 0, 0}; // coordinates, axis
+    // score, then (ties must not depend on how the mesh is numbered and distributed) coordinates and axis, negative
+    using Candidate = std::array<double, 5>;
+    Candidate best{-PETSC_MAX_REAL, 0, 0, 0, 0};
     for (PetscInt v : vertices) {
       Coordinates x;
       PetscCall(node_coordinates(v, x.data()));
-      for (int axis = 0; axis < 3; ++axis) {
-        const PetscReal s = score(k, x, axis);
-        if (s <= best.score) continue;
-        best.score = s;
-        std::copy(x.begin(), x.end(), found);
-        found[3] = axis;
-      }
+      for (int axis = 0; axis < 3; ++axis)
+        best = std::max(best, Candidate{score(k, x, axis), -x[0], -x[1], -x[2], -(double)axis});
     }
-    PetscCallMPI(MPI_Allreduce(&best, &winner, 1, MPI_DOUBLE_INT, MPI_MAXLOC, comm));
-    PetscCallMPI(MPI_Bcast(found, 4, MPI_DOUBLE, winner.rank, comm));
-    std::copy_n(found, 3, chosen[k].begin());
-    if (k == 1) along = static_cast<int>(found[3]);
-    if (k == 2) across = static_cast<int>(found[3]);
+    std::vector<Candidate> all(size);
+    PetscCallMPI(MPI_Allgather(best.data(), 5, MPI_DOUBLE, all.data(), 5, MPI_DOUBLE, comm));
+    best = *std::max_element(all.begin(), all.end());
+    for (int d = 0; d < 3; ++d) chosen[k][d] = -best[1 + d];
+    const int axis = static_cast<int>(-best[4]);
+    if (k == 1) along = axis;
+    if (k == 2) across = axis;
   }
   for (int k = 0; k < 3; ++k) {
     Pin pin;
