@@ -7,6 +7,7 @@
 #include <cmath>
 #include <cstdio>
 #include <iterator>
+#include <numeric>
 
 namespace pulmo {
 
@@ -105,25 +106,35 @@ PetscErrorCode find_bodies(DM dm, PetscInt begin, PetscInt end, std::vector<Pets
   for (PetscInt v = begin; v < end; ++v)
     of[v] = numbers[v - begin] < 0 ? -(numbers[v - begin] + 1) : numbers[v - begin];
   PetscCall(ISRestoreIndices(numbering, &numbers));
+
+  // vertices joined by cells of this rank: a tree for each body, known by its root
+  std::vector<PetscInt> parent(static_cast<std::size_t>(point_end));
+  std::iota(parent.begin(), parent.end(), 0);
+  const auto root = [&](PetscInt v) {
+    while (parent[v] != v) v = parent[v] = parent[parent[v]];
+    return v;
+  };
+  for (PetscInt c = cell_begin; c < cell_end; ++c) {
+    PetscInt *closure = nullptr, n;
+    PetscCall(DMPlexGetTransitiveClosure(dm, c, PETSC_TRUE, &n, &closure));
+    const PetscInt joined = root(closure[2 * (n - 1)]); // vertices come last
+    for (PetscInt i = 0; i < n; ++i)
+      if (closure[2 * i] >= begin && closure[2 * i] < end) parent[root(closure[2 * i])] = joined;
+    PetscCall(DMPlexRestoreTransitiveClosure(dm, c, PETSC_TRUE, &n, &closure));
+  }
+
   PetscCall(DMGetPointSF(dm, &sf));
   PetscCall(PetscSFGetGraph(sf, &roots, nullptr, nullptr, nullptr));
-  while (changed) { // the least number spreads over cells, then over ranks
+  while (changed) { // the least number spreads over each body, then over ranks
     changed = 0;
-    for (bool sweep = true; sweep;) {
-      sweep = false;
-      for (PetscInt c = cell_begin; c < cell_end; ++c) {
-        PetscInt *closure = nullptr, n, least = PETSC_MAX_INT;
-        PetscCall(DMPlexGetTransitiveClosure(dm, c, PETSC_TRUE, &n, &closure));
-        for (PetscInt i = 0; i < n; ++i) least = std::min(least, of[closure[2 * i]]);
-        for (PetscInt i = 0; i < n; ++i) {
-          PetscInt &mine = of[closure[2 * i]];
-          if (closure[2 * i] < begin || closure[2 * i] >= end || mine == least) continue;
-          mine = least;
-          sweep = true;
-          changed = 1;
-        }
-        PetscCall(DMPlexRestoreTransitiveClosure(dm, c, PETSC_TRUE, &n, &closure));
-      }
+    for (PetscInt v = begin; v < end; ++v) {
+      PetscInt &least = of[root(v)];
+      if (of[v] < least) changed = 1;
+      least = std::min(least, of[v]);
+    }
+    for (PetscInt v = begin; v < end; ++v) {
+      if (of[v] != of[root(v)]) changed = 1;
+      of[v] = of[root(v)];
     }
     if (roots >= 0) {
       sent = of;
@@ -202,8 +213,8 @@ PetscErrorCode Mesh::read(const Options &options, bool ventilated)
 
   // one label per physical name
   PetscCall(PetscOptionsSetValue(nullptr, "-dm_plex_gmsh_use_regions", "true"));
-  // cells that are neighbours in space become neighbours in memory: mesh generators number them at random, and then the
-  // assembly of the matrix mostly waits for it
+  // cells that are neighbours in space become neighbours in memory: mesh generators number them at random, and then
+  // assembly, products and smoothers mostly wait for memory
   PetscCall(PetscOptionsHasName(nullptr, nullptr, "-dm_plex_reorder", &given));
   if (!given) PetscCall(PetscOptionsSetValue(nullptr, "-dm_plex_reorder", MATORDERINGRCM));
   PetscCall(DMCreate(comm, dm_.out()));
@@ -454,14 +465,9 @@ PetscErrorCode Mesh::regions(std::vector<Region> &list) const
   PetscCall(DMPlexGetHeightStratum(dm_, 0, &begin, &end));
   PetscCall(find_bodies(dm_, vertex_begin, vertex_end, body_of));
   for (PetscInt c = begin; c < end; ++c) {
-    PetscInt *closure = nullptr, n;
-    PetscCall(DMPlexGetTransitiveClosure(dm_, c, PETSC_TRUE, &n, &closure));
-    for (PetscInt i = 0; i < n; ++i)
-      if (closure[2 * i] >= vertex_begin && closure[2 * i] < vertex_end) {
-        cell_body.push_back(body_of[closure[2 * i] - vertex_begin]);
-        break;
-      }
-    PetscCall(DMPlexRestoreTransitiveClosure(dm_, c, PETSC_TRUE, &n, &closure));
+    const PetscInt *cone = &c; // a face, an edge, a vertex of the cell
+    for (int depth = 0; depth < 3; ++depth) PetscCall(DMPlexGetCone(dm_, cone[0], &cone));
+    cell_body.push_back(body_of[cone[0] - vertex_begin]);
   }
   for (;;) {
     PetscInt next;
@@ -551,12 +557,12 @@ PetscErrorCode Mesh::pin_body(const std::vector<PetscInt> &vertices, std::vector
   using Coordinates = std::array<PetscReal, 3>;
   constexpr PetscReal off_axis = 3; // weight of what leads away from an axis
   const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
-  PetscMPIInt rank;
+  PetscMPIInt size;
   std::array<Coordinates, 3> chosen{};
   int along = 2, across = 0; // the axis that AB is close to; the second axis of the plane that ABC is close to
 
   PetscFunctionBeginUser;
-  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  PetscCallMPI(MPI_Comm_size(comm, &size));
   // A: the lowest vertex. B: far from A and close to an axis through A. C: far from AB and close to a plane of two
   // axes through it. Then the held components hardly turn a lung that swells. Ranks that share a vertex have the same
   // coordinates for it, so the choice by coordinates is the same on all.
@@ -569,27 +575,22 @@ PetscErrorCode Mesh::pin_body(const std::vector<PetscInt> &vertices, std::vector
     return axis == along ? -PETSC_MAX_REAL : d[axis] - off_axis * d[3 - along - axis];
   };
   for (int k = 0; k < 3; ++k) {
-    struct {
-      double score;
-      int rank;
-    } best{-PETSC_MAX_REAL, rank}, winner;
-    double found[4] = {0, 0, 0, 0}; // coordinates, axis
+    // score, then (ties must not depend on how the mesh is numbered and distributed) coordinates and axis, negative
+    using Candidate = std::array<double, 5>;
+    Candidate best{-PETSC_MAX_REAL, 0, 0, 0, 0};
     for (PetscInt v : vertices) {
       Coordinates x;
       PetscCall(node_coordinates(v, x.data()));
-      for (int axis = 0; axis < 3; ++axis) {
-        const PetscReal s = score(k, x, axis);
-        if (s <= best.score) continue;
-        best.score = s;
-        std::copy(x.begin(), x.end(), found);
-        found[3] = axis;
-      }
+      for (int axis = 0; axis < 3; ++axis)
+        best = std::max(best, Candidate{score(k, x, axis), -x[0], -x[1], -x[2], -(double)axis});
     }
-    PetscCallMPI(MPI_Allreduce(&best, &winner, 1, MPI_DOUBLE_INT, MPI_MAXLOC, comm));
-    PetscCallMPI(MPI_Bcast(found, 4, MPI_DOUBLE, winner.rank, comm));
-    std::copy_n(found, 3, chosen[k].begin());
-    if (k == 1) along = static_cast<int>(found[3]);
-    if (k == 2) across = static_cast<int>(found[3]);
+    std::vector<Candidate> all(size);
+    PetscCallMPI(MPI_Allgather(best.data(), 5, MPI_DOUBLE, all.data(), 5, MPI_DOUBLE, comm));
+    best = *std::max_element(all.begin(), all.end());
+    for (int d = 0; d < 3; ++d) chosen[k][d] = -best[1 + d];
+    const int axis = static_cast<int>(-best[4]);
+    if (k == 1) along = axis;
+    if (k == 2) across = axis;
   }
   for (int k = 0; k < 3; ++k) {
     Pin pin;

@@ -1,6 +1,7 @@
 #include "pulmo/model.hpp"
 
 #include "pulmo/mesh.hpp"
+#include "pulmo/pattern.hpp"
 
 #include <algorithm>
 #include <cstring>
@@ -571,15 +572,7 @@ PetscErrorCode Model::stock_residual(PetscReal t, Vec x, Vec x_t, Vec F)
 PetscErrorCode Model::create_matrix(Mat *A) const
 {
   PetscFunctionBeginUser;
-  PetscCall(DMCreateMatrix(dm_, A));
-  if (composition().common_gas_pressure()) {
-    // with a block size of 1 (partly prescribed displacements) PETSc leaves out rows that belong to no field
-    PetscCall(MatSetOption(*A, MAT_NEW_NONZERO_ALLOCATION_ERR, PETSC_FALSE));
-    for (const PetscInt row : closed_rows_) PetscCall(MatSetValue(*A, row, row, 0, INSERT_VALUES));
-    PetscCall(MatAssemblyBegin(*A, MAT_FINAL_ASSEMBLY));
-    PetscCall(MatAssemblyEnd(*A, MAT_FINAL_ASSEMBLY));
-    PetscCall(MatSetOption(*A, MAT_NEW_NONZERO_ALLOCATION_ERR, PETSC_TRUE));
-  }
+  PetscCall(pulmo::create_matrix(dm_, A));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

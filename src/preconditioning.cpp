@@ -1,6 +1,7 @@
 #include "pulmo/preconditioning.hpp"
 
 #include "pulmo/mesh.hpp"
+#include "pulmo/pattern.hpp"
 #include "pulmo/point.hpp"
 #include "pulmo/single_blocks.hpp"
 
@@ -338,7 +339,7 @@ PetscErrorCode FixedStress::setup(DM dm)
   PetscFunctionBeginUser;
   dm_ = dm;
   PetscCall(DMCreateSubDM(dm, 1, &field, is.out(), sub.out()));
-  PetscCall(DMCreateMatrix(sub, matrix_.out()));
+  PetscCall(create_matrix(sub, matrix_.out()));
   PetscCall(DMGetLocalSection(sub, &section));
   PetscCall(DMGetGlobalSection(sub, &global));
   PetscCall(PetscSectionGetChart(section, &begin, &end));
@@ -353,26 +354,29 @@ PetscErrorCode FixedStress::setup(DM dm)
     if (owned) point_row_[p] = dofs[0];
   }
   PetscCall(DMGetLocalSection(dm, &section));
+  std::vector<PetscReal> x(static_cast<std::size_t>(3 * end), PETSC_MAX_REAL); // of the nodes of the displacement
+  for (PetscInt p = begin; p < end; ++p) {
+    PetscInt dof;
+    PetscCall(PetscSectionGetFieldDof(section, p, displacement, &dof));
+    if (dof == 3) PetscCall(node_coordinates(dm, p, &x[3 * p]));
+  }
   PetscCall(DMPlexGetHeightStratum(dm, 0, &cell_begin, &cell_end));
+  rows_.reserve(vertices_ * (cell_end - cell_begin));
   for (PetscInt c = cell_begin; c < cell_end; ++c) {
     PetscInt *closure = nullptr, n_closure;
-    std::vector<std::array<PetscReal, 3>> x;
     PetscReal middle[3] = {0, 0, 0};
+    const std::size_t first = position_.size();
     PetscCall(DMPlexGetTransitiveClosure(dm, c, PETSC_TRUE, &n_closure, &closure));
     for (PetscInt i = 0; i < n_closure; ++i) {
-      PetscInt dof;
-      PetscCall(PetscSectionGetFieldDof(section, closure[2 * i], displacement, &dof));
-      if (dof != 3) continue;
-      x.emplace_back();
-      PetscCall(node_coordinates(dm, closure[2 * i], x.back().data()));
+      const PetscReal *node = &x[3 * closure[2 * i]];
+      if (node[0] != PETSC_MAX_REAL) position_.insert(position_.end(), node, node + 3);
     }
     for (PetscInt i = n_closure - vertices_; i < n_closure; ++i) rows_.push_back(row[closure[2 * i]]); // come last
     PetscCall(DMPlexRestoreTransitiveClosure(dm, c, PETSC_TRUE, &n_closure, &closure));
-    for (const auto &node : x)
-      for (int d = 0; d < 3; ++d) middle[d] += node[d] / static_cast<PetscReal>(x.size());
-    nodes_ = static_cast<PetscInt>(x.size());
-    for (const auto &node : x)
-      for (int d = 0; d < 3; ++d) position_.push_back(node[d] - middle[d]);
+    nodes_ = static_cast<PetscInt>(position_.size() - first) / 3;
+    if (c == cell_begin) position_.reserve(3 * nodes_ * (cell_end - cell_begin));
+    for (std::size_t i = first; i < position_.size(); ++i) middle[(i - first) % 3] += position_[i] / (PetscReal)nodes_;
+    for (std::size_t i = first; i < position_.size(); ++i) position_[i] -= middle[(i - first) % 3];
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }

@@ -35,8 +35,8 @@ public:
 
   /// Declares -mesh_scale; the file name is PETSc's -dm_plex_filename.
   PetscErrorCode declare(Options &options);
-  /// Reads -dm_plex_filename, scales, distributes and checks it. @p ventilated: the scene is a lung, so a volume
-  /// outside what any lung has betrays the wrong unit.
+  /// Reads -dm_plex_filename, renumbers, distributes, scales and checks it. @p ventilated: the scene is a lung, so a
+  /// volume outside what any lung has betrays the wrong unit.
   PetscErrorCode read(const Options &options, bool ventilated);
 
   DM dm() const { return dm_; }

@@ -117,6 +117,7 @@ using ISHandle = Handle<IS, ISDestroy>;
 using MatHandle = Handle<Mat, MatDestroy>;
 using QuadratureHandle = Handle<PetscQuadrature, PetscQuadratureDestroy>;
 using SectionHandle = Handle<PetscSection, PetscSectionDestroy>;
+using SFHandle = Handle<PetscSF, PetscSFDestroy>;
 using TSHandle = Handle<TS, TSDestroy>;
 using VecHandle = Handle<Vec, VecDestroy>;
 using ViewerHandle = Handle<PetscViewer, PetscViewerDestroy>;

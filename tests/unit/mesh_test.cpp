@@ -1,7 +1,10 @@
 // The mesh of a scene: every flavour of MSH that is read, two bodies, refinement, scaling, pins.
 #include "support/scene.hpp"
 
+#include <algorithm>
+#include <array>
 #include <cmath>
+#include <cstdlib>
 
 namespace pulmo::test {
 namespace {
@@ -93,6 +96,78 @@ TEST(Mesh, EachLungHasItsOwnPins)
   for (int body = 0; body < 2; ++body) // the right lung lies at x > 0, the left one at x < 0
     for (int k = 1; k < 3; ++k) EXPECT_GT(pins[3 * body + k].x[0] * pins[3 * body].x[0], 0);
   EXPECT_LT(pins[0].x[0] * pins[3].x[0], 0);
+}
+
+/// Largest difference between the numbers of two cells of this rank that share a face.
+PetscErrorCode bandwidth(DM dm, PetscInt &largest)
+{
+  PetscInt begin, end;
+
+  PetscFunctionBeginUser;
+  largest = 0;
+  PetscCall(DMPlexGetHeightStratum(dm, 1, &begin, &end));
+  for (PetscInt face = begin; face < end; ++face) {
+    PetscInt n;
+    const PetscInt *cells;
+    PetscCall(DMPlexGetSupportSize(dm, face, &n));
+    PetscCall(DMPlexGetSupport(dm, face, &cells));
+    if (n == 2) largest = std::max(largest, std::abs(cells[0] - cells[1]));
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+// On several ranks, too.
+TEST(Renumbering, BringsNeighboursTogetherAndChangesNothingElse)
+{
+  Mesh mesh, plain;
+  std::vector<Mesh::Region> regions, plain_regions;
+  PetscInt wide, narrow;
+  PULMO_OK(read(mesh, "lung_pair.msh"));
+  PULMO_OK(read(plain, "lung_pair.msh", "-dm_plex_reorder natural"));
+  PULMO_OK(bandwidth(mesh.dm(), narrow));
+  PULMO_OK(bandwidth(plain.dm(), wide));
+  EXPECT_LT(narrow, wide / 4);
+  EXPECT_EQ(mesh.cells(), plain.cells());
+  EXPECT_NEAR(mesh.volume(), plain.volume(), 1e-12 * plain.volume());
+  ASSERT_EQ(mesh.surfaces().size(), plain.surfaces().size());
+  for (const auto &[name, surface] : plain.surfaces())
+    EXPECT_NEAR(mesh.surface(name).area, surface.area, 1e-12 * surface.area) << name;
+  PULMO_OK(mesh.regions(regions));
+  PULMO_OK(plain.regions(plain_regions));
+  ASSERT_EQ(regions.size(), plain_regions.size());
+  for (std::size_t r = 0; r < regions.size(); ++r) {
+    EXPECT_EQ(regions[r].name, plain_regions[r].name);
+    EXPECT_EQ(regions[r].body, plain_regions[r].body);
+    std::array<PetscInt, 2> cells{(PetscInt)regions[r].cells.size(), (PetscInt)plain_regions[r].cells.size()};
+    PULMO_OK(MPI_Allreduce(MPI_IN_PLACE, cells.data(), 2, MPIU_INT, MPI_SUM, PETSC_COMM_WORLD));
+    EXPECT_EQ(cells[0], cells[1]);
+  }
+}
+
+TEST(Renumbering, SharedPointsStayThoseOfTheirOwners)
+{
+  Mesh mesh;
+  PetscSF sf;
+  PetscInt end, roots, n_leaves;
+  const PetscInt *leaves;
+  PULMO_OK(read(mesh, "lung_pair.msh"));
+  PULMO_OK(DMPlexGetChart(mesh.dm(), nullptr, &end));
+  PULMO_OK(DMGetPointSF(mesh.dm(), &sf));
+  PULMO_OK(PetscSFGetGraph(sf, &roots, &n_leaves, &leaves, nullptr));
+  if (roots < 0) return; // one rank
+  std::vector<PetscReal> x(static_cast<std::size_t>(3 * end), 0);
+  for (PetscInt depth = 0; depth < 2; ++depth) {
+    PetscInt first, last;
+    PULMO_OK(DMPlexGetDepthStratum(mesh.dm(), depth, &first, &last));
+    for (PetscInt p = first; p < last; ++p) PULMO_OK(mesh.node_coordinates(p, &x[3 * p]));
+  }
+  for (int d = 0; d < 3; ++d) {
+    std::vector<PetscReal> mine(static_cast<std::size_t>(end)), theirs(mine);
+    for (PetscInt p = 0; p < end; ++p) mine[p] = x[3 * p + d];
+    PULMO_OK(PetscSFBcastBegin(sf, MPIU_REAL, mine.data(), theirs.data(), MPI_REPLACE));
+    PULMO_OK(PetscSFBcastEnd(sf, MPIU_REAL, mine.data(), theirs.data(), MPI_REPLACE));
+    for (PetscInt i = 0; i < n_leaves; ++i) EXPECT_EQ(mine[leaves ? leaves[i] : i], theirs[leaves ? leaves[i] : i]);
+  }
 }
 
 } // namespace
