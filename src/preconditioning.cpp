@@ -98,7 +98,83 @@ PetscErrorCode make_modes(DM dm, PetscInt, PetscInt field, MatNullSpace *modes)
 struct PMultigrid {
   PC mg = nullptr;
   Mat interpolation = nullptr, coarse = nullptr;
+  PetscBool blocked = PETSC_TRUE;          // the smoother works on a copy in 3 x 3 blocks
+  std::vector<PetscInt> diagonal, outside; // blocks of each block row on this rank's columns and on others'
 };
+
+/// Counts the 3 x 3 blocks of the rows of @p A; @p full: there is nothing but such blocks.
+PetscErrorCode count_blocks(Mat A, std::vector<PetscInt> &diagonal, std::vector<PetscInt> &outside, PetscBool *full)
+{
+  PetscInt block_size, begin, end, first, last;
+
+  PetscFunctionBeginUser;
+  PetscCall(MatGetBlockSize(A, &block_size));
+  PetscCall(MatGetOwnershipRange(A, &begin, &end));
+  PetscCall(MatGetOwnershipRangeColumn(A, &first, &last));
+  bool whole = block_size == 3;
+  std::vector<PetscInt> columns; // of the first row of the block
+  for (PetscInt row = begin; row < end && whole; ++row) {
+    PetscInt n;
+    const PetscInt *column;
+    PetscCall(MatGetRow(A, row, &n, &column, nullptr));
+    if ((row - begin) % 3 == 0) {
+      columns.assign(column, column + n);
+      whole = n % 3 == 0;
+      for (PetscInt j = 0; j < n && whole; ++j)
+        whole = column[j] == column[j - j % 3] + j % 3 && column[j] % 3 == j % 3;
+      const auto own =
+          std::count_if(columns.begin(), columns.end(), [&](PetscInt j) { return first <= j && j < last; });
+      diagonal.push_back(static_cast<PetscInt>(own) / 3);
+      outside.push_back((n - static_cast<PetscInt>(own)) / 3);
+    } else {
+      whole = std::equal(columns.begin(), columns.end(), column, column + n);
+    }
+    PetscCall(MatRestoreRow(A, row, &n, &column, nullptr));
+  }
+  *full = PetscBool(whole);
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, full, 1, MPIU_BOOL, MPI_LAND, PetscObjectComm((PetscObject)A)));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// A copy of @p A in blocks. It is made anew for each setup: some versions of PETSc keep the inverted diagonal of a
+/// BAIJ matrix when its values change.
+PetscErrorCode blocked_copy(Mat A, const std::vector<PetscInt> &diagonal, const std::vector<PetscInt> &outside, Mat *B)
+{
+  PetscInt rows, columns, begin, end;
+  std::vector<PetscInt> blocks;
+  std::vector<PetscScalar> values;
+
+  PetscFunctionBeginUser;
+  PetscCall(MatGetLocalSize(A, &rows, &columns));
+  PetscCall(MatCreate(PetscObjectComm((PetscObject)A), B));
+  PetscCall(MatSetSizes(*B, rows, columns, PETSC_DETERMINE, PETSC_DETERMINE));
+  PetscCall(MatSetType(*B, MATBAIJ));
+  PetscCall(MatSeqBAIJSetPreallocation(*B, 3, 0, diagonal.data()));
+  PetscCall(MatMPIBAIJSetPreallocation(*B, 3, 0, diagonal.data(), 0, outside.data()));
+  PetscCall(MatSetOption(*B, MAT_NO_OFF_PROC_ENTRIES, PETSC_TRUE));
+  PetscCall(MatGetOwnershipRange(A, &begin, &end));
+  for (PetscInt row = begin; row < end; ++row) {
+    PetscInt n;
+    const PetscInt *column;
+    const PetscScalar *value;
+    PetscCall(MatGetRow(A, row, &n, &column, &value));
+    if ((row - begin) % 3 == 0) {
+      blocks.clear();
+      values.clear();
+      for (PetscInt j = 0; j < n; j += 3) blocks.push_back(column[j] / 3);
+    }
+    values.insert(values.end(), value, value + n);
+    PetscCall(MatRestoreRow(A, row, &n, &column, &value));
+    if ((row - begin) % 3 == 2) {
+      const PetscInt block_row = row / 3;
+      PetscCall(
+          MatSetValuesBlocked(*B, 1, &block_row, (PetscInt)blocks.size(), blocks.data(), values.data(), INSERT_VALUES));
+    }
+  }
+  PetscCall(MatAssemblyBegin(*B, MAT_FINAL_ASSEMBLY));
+  PetscCall(MatAssemblyEnd(*B, MAT_FINAL_ASSEMBLY));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
 
 /// The interpolation from P1 to the P2 displacement of @p dm, and the rigid-body modes of P1.
 PetscErrorCode make_interpolation(DM dm, PetscInt block_size, Mat *P, MatNullSpace *modes)
@@ -212,13 +288,23 @@ PetscErrorCode setup_p_multigrid(PC pc)
     PetscCall(PCMGSetLevels(self->mg, 2, nullptr));
     PetscCall(PCMGSetInterpolation(self->mg, 1, self->interpolation));
     PetscCall(PCSetFromOptions(self->mg));
+    PetscCall(PCGetOptionsPrefix(self->mg, &prefix));
+    PetscCall(PetscOptionsGetBool(nullptr, prefix, "-mg_levels_blocked", &self->blocked, nullptr));
+    if (A != B) self->blocked = PETSC_FALSE;
+    if (self->blocked) PetscCall(count_blocks(B, self->diagonal, self->outside, &self->blocked));
   } else {
     PetscCall(MatPtAP(B, self->interpolation, MAT_REUSE_MATRIX, 1, &self->coarse));
   }
   PetscCall(PCMGGetCoarseSolve(self->mg, &coarse));
   PetscCall(KSPSetOperators(coarse, self->coarse, self->coarse));
   PetscCall(PCMGGetSmoother(self->mg, 1, &smoother));
-  PetscCall(KSPSetOperators(smoother, A, B));
+  if (self->blocked) {
+    MatHandle blocks;
+    PetscCall(blocked_copy(B, self->diagonal, self->outside, blocks.out()));
+    PetscCall(KSPSetOperators(smoother, blocks, blocks));
+  } else {
+    PetscCall(KSPSetOperators(smoother, A, B));
+  }
   PetscCall(PCSetOperators(self->mg, A, B));
   PetscCall(PCSetUp(self->mg));
   PetscFunctionReturn(PETSC_SUCCESS);
