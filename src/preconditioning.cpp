@@ -302,6 +302,7 @@ PetscErrorCode setup_p_multigrid(PC pc)
     MatHandle blocks;
     PetscCall(blocked_copy(B, self->diagonal, self->outside, blocks.out()));
     PetscCall(KSPSetOperators(smoother, blocks, blocks));
+    PetscCall(PCMGSetResidual(self->mg, 1, PCMGResidualDefault, blocks)); // PCMG would keep that of the first setup
   } else {
     PetscCall(KSPSetOperators(smoother, A, B));
   }

@@ -94,7 +94,7 @@ def counts(path, title, entries):
     handles = [plt.Line2D([], [], color=shades[i % len(shades)], label=name) for i, name in enumerate(names)]
     handles += [plt.Line2D([], [], color="k", lw=0, marker=markers[j % len(markers)], label=f"Δt {step} s")
                 for j, step in enumerate(steps)]
-    figure.legend(handles=handles, loc="outside right upper", fontsize=7)
+    axes[0][-1].legend(handles=handles, loc="upper left", bbox_to_anchor=(1.02, 1), fontsize=7, frameon=False)
     figure.suptitle(title, fontsize=10)
     figure.savefig(path, dpi=110)
     plt.close(figure)
