@@ -86,7 +86,7 @@ def counts(path, title, entries):
                     axis.plot(*zip(*points), color=shades[i % len(shades)], marker=markers[j % len(markers)], lw=0.8, ms=5, alpha=0.8)
         axis.axhline(15, color="#999999", lw=0.8, ls="--")
         axis.set(xscale="log", xlabel="k, mm²/(kPa s)", title=panel)
-        axis.set_ylim(bottom=0)
+        axis.set_ylim(0, 1.1 * max(15, *(e[6] for e in entries)))
         axis.spines[["top", "right"]].set_visible(False)
     axes[0][0].set_ylabel("largest Krylov count of a solve")
     several = [len({line[i] for line in lines}) > 1 for i in range(3)]
