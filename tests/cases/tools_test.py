@@ -101,6 +101,28 @@ class Tools(unittest.TestCase):
         self.assertEqual(repeated[2]["outcome"], "failed")
         self.assertIn("nonsense", repeated[2]["remark"])
 
+    def test_benchmark_counts_krylov_iterations(self):
+        """The counts of the table are those of the program's own summary and signals."""
+        folder = pulmo.scratch()
+        few = ["solve", "--mesh", pulmo.mesh("cube_lung.msh"), "--laws", "yoshihara", "--permeability", "1e3", "--dt", "0.05",
+               "--phases", "pressure", "flow", "common", "stretch", "--stretch", "1.2", "--output", folder, "--", "@iterative"]
+        first = benchmark(*few)
+        self.assertEqual(first.returncode, 0, first.stdout + first.stderr)
+        rows = {row["phase"]: row for row in table(os.path.join(folder, "solve.csv"))}
+        self.assertEqual(list(rows), ["pressure", "flow", "common", "stretch"])
+        case = pulmo.finished(pulmo.options_file("solvers/iterative.opts") + pulmo.PCV + pulmo.CUBE +
+                              ["-tissue", "yoshihara", "-airflow_permeability", "1e3", "-ventilator_ramp", "0", "-ts_max_time", "0.1",
+                               "-ksp_rtol", "1e-5", "-snes_lag_jacobian", "1", "-snes_lag_preconditioner", "1"])
+        summary, row = case.json(), rows["pressure"]
+        self.assertEqual((int(row["Newton"]), int(row["solves"])), 2 * (summary["newton_iterations"],))
+        self.assertAlmostEqual(float(row["Krylov/solve"]), summary["krylov_iterations"] / summary["newton_iterations"], delta=0.051)
+        self.assertGreaterEqual(int(row["largest"]), float(row["Krylov/solve"]))
+        self.assertEqual(int(rows["common"]["solves"]), 2 * int(rows["common"]["Newton"]))
+        self.assertGreater(float(rows["stretch"]["largest J"]), 1.15)
+        with open(os.path.join(folder, "solve.png"), "rb") as f:
+            self.assertEqual(f.read(8), b"\x89PNG\r\n\x1a\n")
+        self.assertEqual(benchmark(*few).stdout.count("kept"), 4)
+
     def test_benchmark_refuses(self):
         few = ["strategies", "pcv", "--mesh", pulmo.mesh("cube_lung.msh"), "--output", pulmo.scratch()]
         for arguments, named in ((few, "--"),
@@ -116,6 +138,9 @@ class Tools(unittest.TestCase):
                                  (["scaling", "--ranks", "2"], "begin with 1"),
                                  (["scaling", "--ranks", "1", "--count-ranks"], "several ranks"),
                                  (["scaling", "--", "@direct", "@iterative"], "one string"),
+                                 (["solve", "--mesh", "none.msh"], "none.msh"),
+                                 (["solve", "--stretch", "0.9"], "--stretch"),
+                                 (["solve", "--dt", "2"], "--dt"),
                                  (["assembly", "--", "@direct"], "no flags")):
             with self.subTest(arguments=arguments):
                 refused = benchmark(*arguments)

@@ -1,4 +1,4 @@
-"""Bars of seconds by stage and of memory, Krylov iterations over time: one picture for runs side by side."""
+"""Pictures of benchmarks: runs side by side (seconds by stage, memory, Krylov iterations), iterations over permeability."""
 import csv
 import textwrap
 
@@ -59,6 +59,42 @@ def side_by_side(path, title, entries):
     krylov.set_ylim(bottom=0)
     if krylov.lines:
         krylov.legend(fontsize=7, ncols=2)
+    figure.suptitle(title, fontsize=10)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    print(f"wrote {path}")
+
+
+def counts(path, title, entries):
+    """Panels by phase, largest Krylov count over permeability.
+
+    `entries`: (solver, law, tetrahedra, phase, permeability, step, count) of each run. A line for each mesh, solver and law,
+    coloured; its marker tells the step.
+    """
+    panels = list(dict.fromkeys(e[3] for e in entries))
+    if not panels:
+        return
+    lines = list(dict.fromkeys((e[0], e[1], e[2]) for e in entries))
+    steps = list(dict.fromkeys(e[5] for e in entries))
+    shades, markers = plt.get_cmap("tab10").colors, "osv^Dx+"
+    figure, axes = plt.subplots(1, len(panels), figsize=(2 + 3 * len(panels), 4), sharey=True, squeeze=False, layout="constrained")
+    for axis, panel in zip(axes[0], panels):
+        for i, line in enumerate(lines):
+            for j, step in enumerate(steps):
+                points = sorted((float(e[4]), e[6]) for e in entries if (e[0], e[1], e[2], e[3], e[5]) == (*line, panel, step))
+                if points:
+                    axis.plot(*zip(*points), color=shades[i % len(shades)], marker=markers[j % len(markers)], lw=0.8, ms=5, alpha=0.8)
+        axis.axhline(15, color="#999999", lw=0.8, ls="--")
+        axis.set(xscale="log", xlabel="k, mm²/(kPa s)", title=panel)
+        axis.set_ylim(0, 1.1 * max(15, *(e[6] for e in entries)))
+        axis.spines[["top", "right"]].set_visible(False)
+    axes[0][0].set_ylabel("largest Krylov count of a solve")
+    several = [len({line[i] for line in lines}) > 1 for i in range(3)]
+    names = [" ".join(str(part) + (" tets" if i == 2 else "") for i, part in enumerate(line) if several[i] or i == 2) for line in lines]
+    handles = [plt.Line2D([], [], color=shades[i % len(shades)], label=name) for i, name in enumerate(names)]
+    handles += [plt.Line2D([], [], color="k", lw=0, marker=markers[j % len(markers)], label=f"Δt {step} s")
+                for j, step in enumerate(steps)]
+    axes[0][-1].legend(handles=handles, loc="upper left", bbox_to_anchor=(1.02, 1), fontsize=7, frameon=False)
     figure.suptitle(title, fontsize=10)
     figure.savefig(path, dpi=110)
     plt.close(figure)

@@ -152,15 +152,19 @@ def measured(command, folder, repeat=0, ranks=1, timeout=None):
     return result
 
 
-def waveform(result):
-    """Volume (ml) and airway pressure (cmH2O) by time (s, rounded to 1 ns) of the steps that were accepted."""
+def signals(result):
+    """Rows of the accepted steps of a run, as texts by column."""
     for name in ("signals.csv", "signals.csv.part"):
         path = result["folder"] / "run" / name
         if path.exists():
             with open(path, newline="") as f:
-                rows = [row for row in csv.DictReader(f) if row.get("volume_ml")]
-            return {round(float(r["time_s"]), 9): (float(r["volume_ml"]), float(r["airway_pressure_cmH2O"])) for r in rows}
-    return {}
+                return [row for row in csv.DictReader(f) if row.get("volume_ml")]
+    return []
+
+
+def waveform(result):
+    """Volume (ml) and airway pressure (cmH2O) by time (s, rounded to 1 ns) of the steps that were accepted."""
+    return {round(float(r["time_s"]), 9): (float(r["volume_ml"]), float(r["airway_pressure_cmH2O"])) for r in signals(result)}
 
 
 def differences(result, reference):
