@@ -52,7 +52,8 @@ protected:
   static PetscReal direction(int step, PetscInt i) { return 0.1 * (step ? std::cos(0.7 * i) : std::sin(1. + i)); }
   PetscErrorCode improve()
   {
-    return predictor_.improve(snes_, [](Vec) { return PetscErrorCode(0); }, x_, norm_);
+    return predictor_.improve(
+        snes_, [](Vec) { return PetscErrorCode(0); }, x_, norm_);
   }
   PetscReal residual_norm()
   {
