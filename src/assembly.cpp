@@ -1,4 +1,5 @@
 #include "pulmo/assembly.hpp"
+#include "pulmo/simd.hpp"
 
 #include <algorithm>
 #include <array>
@@ -526,26 +527,29 @@ PetscErrorCode Assembly::add_to_matrix(PetscInt cell, const PetscScalar *matrix,
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-/// Displacements of the nodes of a cell, each padded to the four doubles of a vector register.
-using NodeDisplacements = std::array<PetscScalar[4], 32>;
+/// Displacements of the nodes of a cell; the fourth entry is zero.
+struct NodeDisplacements {
+  Vector4 of[32];
+  Vector4 &operator[](PetscInt a) { return of[a]; }
+  const Vector4 &operator[](PetscInt a) const { return of[a]; }
+};
 
 static void gather_displacements(const PetscInt *dofs, PetscInt nodes, const PetscScalar *x, NodeDisplacements &u)
 {
-  for (PetscInt a = 0; a < nodes; ++a)
-    for (int i = 0; i < 4; ++i) u[a][i] = i < 3 ? x[dofs[3 * a + i]] : 0;
+  for (PetscInt a = 0; a < nodes; ++a) u[a] = Vector4{x[dofs[3 * a]], x[dofs[3 * a + 1]], x[dofs[3 * a + 2]], 0};
 }
 
 /// Grad u at a sample point, with @p D the derivatives of the basis there, from the cell's displacements.
 static void sample_gradient(const PetscReal *D, const PetscReal *inverse, PetscInt nodes, const NodeDisplacements &u,
                             PetscScalar H[9])
 {
-  PetscScalar A[3][4] = {}; // [derivative][component]
+  Vector4 along[3] = {}; // the axes of the reference cell
   for (PetscInt a = 0; a < nodes; ++a)
-    for (int g = 0; g < 3; ++g)
-      for (int i = 0; i < 4; ++i) A[g][i] += D[3 * a + g] * u[a][i];
-  for (int i = 0; i < 3; ++i)
-    for (int d = 0; d < 3; ++d)
-      H[3 * i + d] = A[0][i] * inverse[d] + A[1][i] * inverse[3 + d] + A[2][i] * inverse[6 + d];
+    for (int g = 0; g < 3; ++g) along[g] += D[3 * a + g] * u[a];
+  for (int d = 0; d < 3; ++d) {
+    const Vector4 h = along[0] * inverse[d] + along[1] * inverse[3 + d] + along[2] * inverse[6 + d];
+    for (int i = 0; i < 3; ++i) H[3 * i + d] = h[i];
+  }
 }
 
 void Assembly::point_states(PetscInt c, const PetscScalar *x, std::vector<PointState> &states) const

@@ -1,7 +1,9 @@
 #include "pulmo/integration.hpp"
 
 #include "pulmo/point.hpp"
+#include "pulmo/simd.hpp"
 
+#include <algorithm>
 #include <petsc/private/petscfeimpl.h>
 
 #include <cstdlib>
@@ -46,9 +48,6 @@ private:
   PetscScalar *data_;
   std::size_t used_ = 0;
 };
-
-/// Four doubles that the compiler keeps in one vector register (or two, or four).
-typedef double Vector4 __attribute__((vector_size(32), aligned(8), may_alias));
 
 inline const Vector4 &four(const double *p)
 {
@@ -166,13 +165,15 @@ PetscErrorCode make_fields(PetscDS ds, PetscTabulation *T, PetscInt replica, Scr
 /// Everything that callbacks read at the points of one cell or face.
 struct PointData {
   const Fields *fields;
-  PetscScalar *gradients[max_fields];  ///< [point][dim][stride], real space
+  PetscScalar *gradients[max_fields];  ///< [point][dim][stride], real space; for matrices only
+  PetscReal inverse_J[dim * dim];      ///< d(reference)/d(real)
   PetscScalar *u, *u_t, *u_x, *rate_x; ///< [point][...] with the offsets of Fields; rate_x: gradients of u_t
   PetscScalar *weights;                ///< quadrature weight times det J
   PetscReal *x, *normals;              ///< [point][3]
   std::vector<PointState> states;
 
-  PointData(const Fields &f, Scratch &scratch) : fields(&f), states(static_cast<std::size_t>(f.points))
+  PointData(const Fields &f, Scratch &scratch, bool matrices)
+      : fields(&f), states(static_cast<std::size_t>(f.points)), with_gradients(matrices)
   {
     for (PetscInt i = 0; i < f.n; ++i) gradients[i] = scratch.take(f.points * dim * f.basis[i].stride);
     u = scratch.take(f.points * f.total_components);
@@ -190,52 +191,73 @@ struct PointData {
     return size + 4 * Scratch::padded(f.points * f.total_components * dim);
   }
 
-  /// Gradients in real space, field values, rates and kinematic states from the element's coefficients.
-  void evaluate(const PetscReal inverse_J[9], const PetscScalar coefficients[], const PetscScalar coefficients_t[])
+  /// Field values, rates and kinematic states (for matrices the basis' gradients, too) from the element's coefficients.
+  void evaluate(const PetscReal inverse[dim * dim], const PetscScalar coefficients[],
+                const PetscScalar coefficients_t[])
   {
-    const PetscInt Nc = fields->total_components;
+    std::copy_n(inverse, dim * dim, inverse_J);
     for (PetscInt f = 0; f < fields->n; ++f) {
-      const ScalarBasis &basis = fields->basis[f];
-      const PetscInt n = basis.stride;
-      for (PetscInt q = 0; q < fields->points; ++q) {
-        for (PetscInt d = 0; d < dim; ++d) {
-          const PetscReal s[3] = {inverse_J[d], inverse_J[dim + d], inverse_J[2 * dim + d]};
-          combine(n, s, basis.derivatives + q * dim * n, gradients[f] + (q * dim + d) * n);
-        }
-      }
-    }
-    for (PetscInt f = 0; f < fields->n; ++f) {
-      interpolate(f, coefficients, u, u_x);
-      if (coefficients_t) interpolate(f, coefficients_t, u_t, rate_x);
+      interpolate(f, coefficients, coefficients_t);
+      if (with_gradients) map_gradients(f);
     }
     for (PetscInt q = 0; q < fields->points; ++q) {
-      const PetscInt offset = q * Nc * dim + fields->uOff_x[displacement];
+      const PetscInt offset = q * fields->total_components * dim + fields->uOff_x[displacement];
       make_point_state(u_x + offset, rate_x + offset, states[q]);
     }
   }
 
 private:
-  /// Values and gradients of field @p f at all points, the components of a node in one vector.
-  void interpolate(PetscInt f, const PetscScalar coefficients[], PetscScalar *values, PetscScalar *values_x) const
+  void map_gradients(PetscInt f)
   {
-    const ScalarBasis &basis = fields->basis[f];
-    const PetscInt n = basis.stride, C = basis.components, Nc = fields->total_components;
-    Vector4 node[max_nodes];
-    for (PetscInt a = 0; a < basis.nodes; ++a)
-      for (PetscInt c = 0; c < 4; ++c) node[a][c] = c < C ? coefficients[basis.offset + a * C + c] : 0;
+    const PetscInt n = fields->basis[f].stride;
     for (PetscInt q = 0; q < fields->points; ++q) {
-      const PetscScalar *B = basis.values + q * n, *G = gradients[f] + q * dim * n;
-      Vector4 s = {0, 0, 0, 0}, s_x[dim] = {s, s, s};
-      for (PetscInt a = 0; a < basis.nodes; ++a) {
-        s += B[a] * node[a];
-        for (PetscInt d = 0; d < dim; ++d) s_x[d] += G[d * n + a] * node[a];
-      }
-      for (PetscInt c = 0; c < C; ++c) {
-        values[q * Nc + fields->uOff[f] + c] = s[c];
-        for (PetscInt d = 0; d < dim; ++d) values_x[q * Nc * dim + fields->uOff_x[f] + c * dim + d] = s_x[d][c];
+      for (PetscInt d = 0; d < dim; ++d) {
+        const PetscReal s[3] = {inverse_J[d], inverse_J[dim + d], inverse_J[2 * dim + d]};
+        combine(n, s, fields->basis[f].derivatives + q * dim * n, gradients[f] + (q * dim + d) * n);
       }
     }
   }
+
+  /// Values and gradients of field @p f and of its rate at all points.
+  void interpolate(PetscInt f, const PetscScalar coefficients[], const PetscScalar coefficients_t[])
+  {
+    const ScalarBasis &basis = fields->basis[f];
+    const PetscInt n = basis.stride, C = basis.components, Nc = fields->total_components;
+    Vector8 node[max_nodes];
+    const auto entry = [&](const PetscScalar *list, PetscInt a, PetscInt c) {
+      return list && c < C ? list[basis.offset + a * C + c] : 0;
+    };
+    for (PetscInt a = 0; a < basis.nodes; ++a) {
+      const PetscScalar *e = coefficients, *e_t = coefficients_t;
+      node[a] = Vector8{entry(e, a, 0),   entry(e, a, 1),   entry(e, a, 2),   0,
+                        entry(e_t, a, 0), entry(e_t, a, 1), entry(e_t, a, 2), 0};
+    }
+    for (PetscInt q = 0; q < fields->points; ++q) {
+      const PetscScalar *B = basis.values + q * n, *D = basis.derivatives + q * dim * n;
+      Vector8 s{}, s_0{}, s_1{}, s_2{}; // value, derivatives in the reference cell
+      for (PetscInt a = 0; a < basis.nodes; ++a) {
+        s += B[a] * node[a];
+        s_0 += D[a] * node[a];
+        s_1 += D[n + a] * node[a];
+        s_2 += D[2 * n + a] * node[a];
+      }
+      PetscScalar *value = u + q * Nc + fields->uOff[f], *rate = u_t + q * Nc + fields->uOff[f];
+      for (PetscInt c = 0; c < C; ++c) {
+        value[c] = s[c];
+        rate[c] = s[4 + c];
+      }
+      for (PetscInt d = 0; d < dim; ++d) {
+        const Vector8 g = inverse_J[d] * s_0 + inverse_J[dim + d] * s_1 + inverse_J[2 * dim + d] * s_2;
+        const PetscInt place = q * Nc * dim + fields->uOff_x[f] + d;
+        for (PetscInt c = 0; c < C; ++c) {
+          u_x[place + c * dim] = g[c];
+          rate_x[place + c * dim] = g[4 + c];
+        }
+      }
+    }
+  }
+
+  bool with_gradients;
 };
 
 // ------------------------------------------------------------------------------------------------- callbacks
@@ -353,25 +375,29 @@ struct JacobianCallbacks {
   PetscInt count() const { return n0 + n1 + n2 + n3; }
 };
 
-/// vector[node * C + c] += sum_q w (f0_c B + f1_cd G_d).
+/// vector[node * C + c] += sum_q w (f0_c B + f1_cd G_d), with f1 taken to the reference cell instead of G from it.
 void add_to_vector(const PointData &data, PetscInt field, const PetscScalar *f0, const PetscScalar *f1,
                    PetscScalar *vector)
 {
   const ScalarBasis &basis = data.fields->basis[field];
   const PetscInt C = basis.components, n = basis.stride;
-  alignas(64) PetscScalar sum[64];
+  const PetscReal *K = data.inverse_J;
+  alignas(64) PetscScalar sum[max_nodes];
   for (PetscInt c = 0; c < C; ++c) {
     for (PetscInt a = 0; a < n; ++a) sum[a] = 0;
     for (PetscInt q = 0; q < data.fields->points; ++q) {
-      const PetscScalar w = data.weights[q], *B = basis.values + q * n, *G = data.gradients[field] + q * dim * n;
+      const PetscScalar w = data.weights[q], *B = basis.values + q * n, *D = basis.derivatives + q * dim * n;
       if (f0) {
         const PetscScalar s = w * f0[q * C + c];
-        for (PetscInt a = 0; a < n; ++a) sum[a] += s * B[a];
+        for (PetscInt a = 0; a < n; a += 4) four(sum + a) += s * four(B + a);
       }
       if (f1) {
         const PetscScalar *f = f1 + (q * C + c) * dim;
-        const PetscScalar s0 = w * f[0], s1 = w * f[1], s2 = w * f[2];
-        for (PetscInt a = 0; a < n; ++a) sum[a] += s0 * G[a] + s1 * G[n + a] + s2 * G[2 * n + a];
+        PetscScalar s[dim];
+        for (PetscInt e = 0; e < dim; ++e)
+          s[e] = w * (f[0] * K[e * dim] + f[1] * K[e * dim + 1] + f[2] * K[e * dim + 2]);
+        for (PetscInt a = 0; a < n; a += 4)
+          four(sum + a) += s[0] * four(D + a) + s[1] * four(D + n + a) + s[2] * four(D + 2 * n + a);
       }
     }
     for (PetscInt a = 0; a < basis.nodes; ++a) vector[basis.offset + a * C + c] += sum[a];
@@ -550,7 +576,7 @@ PetscErrorCode integrate_vectors(PetscDS ds, PetscWeakForm wf, const PetscFormKe
   const Fields &fields = places.fields();
   const PetscInt Nq = fields.points;
   Scratch work(PointData::scratch_size(fields) + 2 * Scratch::padded(Nq * 9));
-  PointData data(fields, work);
+  PointData data(fields, work, false);
   PetscScalar *f0 = work.take(Nq * 3), *f1 = work.take(Nq * 9);
   const Caller call(data, t, 0, places.n_constants, places.constants, places.log);
 
@@ -596,7 +622,7 @@ PetscErrorCode integrate_matrices(PetscDS ds, PetscWeakForm wf, const PetscFormK
   const Fields &fields = places.fields();
   const PetscInt Nq = fields.points;
   Scratch work(PointData::scratch_size(fields) + MatrixBuilder::scratch_size(fields) + 4 * Scratch::padded(Nq * 81));
-  PointData data(fields, work);
+  PointData data(fields, work, true);
   const MatrixBuilder builder(data, work);
   PetscScalar *g0 = work.take(Nq * 9), *g1 = work.take(Nq * 27), *g2 = work.take(Nq * 27), *g3 = work.take(Nq * 81);
   const Caller call(data, t, shift, places.n_constants, places.constants, places.log);

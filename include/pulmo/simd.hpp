@@ -1,0 +1,13 @@
+/// @file
+/// Vectors of doubles that the compiler keeps in as many registers as the machine has them wide.
+#pragma once
+
+namespace pulmo {
+
+/// Four doubles, at any address of a double: the components of a node, or four entries of a row.
+typedef double Vector4 __attribute__((vector_size(32), aligned(8), may_alias));
+
+/// Eight: the components of a node, then their rates.
+typedef double Vector8 __attribute__((vector_size(64)));
+
+} // namespace pulmo
