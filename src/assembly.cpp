@@ -2,7 +2,6 @@
 #include "pulmo/simd.hpp"
 
 #include <algorithm>
-#include <array>
 #include <cmath>
 #include <numeric>
 
@@ -117,6 +116,7 @@ PetscErrorCode Assembly::setup_cells()
   for (PetscReal w : sample_weights_) relative_weights_.push_back(w / total);
   PetscCall(PetscFECreateTabulation(fe, 1, sample_points_, samples.data(), 1, &T));
   nodes_ = T->Nb / T->Nc;
+  PetscCheck(nodes_ <= max_nodes, PETSC_COMM_SELF, PETSC_ERR_SUP, "elements with more than %d nodes", max_nodes);
   for (PetscInt q = 0; q < sample_points_; ++q)
     for (PetscInt a = 0; a < nodes_; ++a)
       for (PetscInt d = 0; d < 3; ++d) sample_gradients_.push_back(T->T[1][((q * T->Nb + a * T->Nc) * T->Nc) * 3 + d]);
@@ -529,7 +529,7 @@ PetscErrorCode Assembly::add_to_matrix(PetscInt cell, const PetscScalar *matrix,
 
 /// Displacements of the nodes of a cell; the fourth entry is zero.
 struct NodeDisplacements {
-  Vector4 of[32];
+  Vector4 of[max_nodes];
   Vector4 &operator[](PetscInt a) { return of[a]; }
   const Vector4 &operator[](PetscInt a) const { return of[a]; }
 };

@@ -20,7 +20,6 @@ namespace {
 constexpr PetscInt dim = 3;
 constexpr PetscInt max_fields = 4;
 constexpr PetscInt max_components = 3;
-constexpr PetscInt max_nodes = 32;
 
 // ------------------------------------------------------------------------------------------------ small arrays
 
@@ -138,7 +137,7 @@ PetscErrorCode make_fields(PetscDS ds, PetscTabulation *T, PetscInt replica, Scr
     ScalarBasis &basis = fields.basis[f];
     const PetscInt Nc = T[f]->Nc, Nb = T[f]->Nb, Np = T[f]->Np;
     PetscCheck(Np == fields.points, PETSC_COMM_SELF, PETSC_ERR_ARG_INCOMP, "fields differ in their quadrature");
-    PetscCheck(Nb / Nc <= max_nodes, PETSC_COMM_SELF, PETSC_ERR_SUP, "more than %d nodes", (int)max_nodes);
+    PetscCheck(Nb / Nc <= max_nodes, PETSC_COMM_SELF, PETSC_ERR_SUP, "more than %d nodes", max_nodes);
     PetscCheck(Nc <= max_components, PETSC_COMM_SELF, PETSC_ERR_SUP, "more than %d components", (int)max_components);
     basis.components = Nc;
     basis.nodes = Nb / Nc;

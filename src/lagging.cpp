@@ -26,7 +26,9 @@ PetscErrorCode Lagging::setup(SNES snes)
 
 void Lagging::judge(SNES snes, PetscInt it, PetscReal norm)
 {
-  // PETSc makes new ones when the steps since the start of the solve plus these counts are a multiple of the lag
+  // PETSc makes new ones when the steps of this solve plus these counts are a multiple of the lag
+  if (it == 0 && !snes->lagjac_persist) snes->jac_iter = 0;
+  if (it == 0 && !snes->lagpre_persist) snes->pre_iter = 0;
   if (in_use() && it > 0 && norm > refresh_ * before_) snes->jac_iter = snes->pre_iter = -it;
   before_ = norm;
 }

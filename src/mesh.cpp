@@ -20,11 +20,34 @@ constexpr PetscReal degenerate = 1e-10;
 /// a man's holds 2500 mm^3; the same in metres 2.5e-6 mm^3).
 constexpr PetscReal least_lung = 1e-1, largest_lung = 1e9;
 
+/// Whether the first cell of a mesh has more nodes than corners.
+PetscErrorCode has_curved_cells(DM dm, bool &curved)
+{
+  Vec coordinates;
+  PetscSection section;
+  PetscScalar *values = nullptr;
+  PetscInt begin, end, dim, corners, n;
+
+  PetscFunctionBeginUser;
+  curved = false;
+  PetscCall(DMPlexGetHeightStratum(dm, 0, &begin, &end));
+  if (begin == end) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(DMGetCoordinateDim(dm, &dim));
+  PetscCall(DMPlexGetConeSize(dm, begin, &corners)); // of a mesh of cells and vertices
+  PetscCall(DMGetCoordinatesLocal(dm, &coordinates));
+  PetscCall(DMGetCoordinateSection(dm, &section));
+  PetscCall(DMPlexVecGetClosure(dm, section, coordinates, begin, &n, &values));
+  curved = n > corners * dim;
+  PetscCall(DMPlexVecRestoreClosure(dm, section, coordinates, begin, &n, &values));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 /// Reads the file on rank 0 alone so that an unreadable mesh is one clear error on all ranks.
 PetscErrorCode check_file(MPI_Comm comm, const std::string &file)
 {
   PetscMPIInt rank;
   int found = 1, readable = 1;
+  bool curved = false;
 
   PetscFunctionBeginUser;
   PetscCallMPI(MPI_Comm_rank(comm, &rank));
@@ -39,19 +62,24 @@ PetscErrorCode check_file(MPI_Comm comm, const std::string &file)
       PetscCall(PetscPushErrorHandler(PetscReturnErrorHandler, nullptr));
       readable = found && DMPlexCreateFromFile(PETSC_COMM_SELF, file.c_str(), "pulmo", PETSC_FALSE, trial.out()) == 0;
       PetscCall(PetscPopErrorHandler());
+      if (readable) PetscCall(has_curved_cells(trial, curved));
     }
   }
   PetscCallMPI(MPI_Bcast(&found, 1, MPI_INT, 0, comm));
   PetscCallMPI(MPI_Bcast(&readable, 1, MPI_INT, 0, comm));
+  PetscCallMPI(MPI_Bcast(&curved, 1, MPI_CXX_BOOL, 0, comm));
   PulmoUserCheck(found, comm, "-dm_plex_filename %s: there is no such file, or it is empty", file.c_str());
   PulmoUserCheck(readable, comm,
                  "-dm_plex_filename %s is not a readable mesh; pulmo reads gmsh's MSH 2.2 and 4.1 (ASCII or binary)",
                  file.c_str());
+  PulmoUserCheck(!curved, comm,
+                 "-dm_plex_filename %s holds elements of higher order; save it with straight ones (gmsh -order 1)",
+                 file.c_str());
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-/// Corner coordinates (4 x 3, mm) of a local tetrahedron; not @p linear if it has more nodes than corners.
-PetscErrorCode cell_corners(DM dm, PetscInt cell, PetscScalar x[12], bool &linear)
+/// Corner coordinates (4 x 3, mm) of a local tetrahedron.
+PetscErrorCode cell_corners(DM dm, PetscInt cell, PetscScalar x[12])
 {
   Vec coordinates;
   PetscSection section;
@@ -63,7 +91,6 @@ PetscErrorCode cell_corners(DM dm, PetscInt cell, PetscScalar x[12], bool &linea
   PetscCall(DMGetCoordinateSection(dm, &section));
   PetscCall(DMPlexVecGetClosure(dm, section, coordinates, cell, &n, &values));
   for (PetscInt i = 0; i < 12; ++i) x[i] = i < n ? values[i] : 0;
-  linear = n == 12;
   PetscCall(DMPlexVecRestoreClosure(dm, section, coordinates, cell, &n, &values));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -255,7 +282,7 @@ PetscErrorCode Mesh::check_cells(const Options &options)
     int rank;
   } worst{1, 0}, global;
   PetscReal volume = 0, centre[3] = {0, 0, 0};
-  PetscInt bad = 0, foreign = 0, curved = 0;
+  PetscInt bad = 0, foreign = 0;
   PetscMPIInt rank;
 
   PetscFunctionBeginUser;
@@ -271,9 +298,7 @@ PetscErrorCode Mesh::check_cells(const Options &options)
       ++foreign;
       continue;
     }
-    bool linear = true;
-    PetscCall(cell_corners(dm_, c, x, linear));
-    if (!linear) ++curved;
+    PetscCall(cell_corners(dm_, c, x));
     for (int i = 0; i < 4; ++i)
       for (int j = 0; j < i; ++j)
         longest = std::max(longest,
@@ -291,8 +316,8 @@ PetscErrorCode Mesh::check_cells(const Options &options)
       for (int d = 0; d < 3; ++d) centre[d] = (x[d] + x[3 + d] + x[6 + d] + x[9 + d]) / 4;
     }
   }
-  PetscInt counts[4] = {end - begin, bad, foreign, curved};
-  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, counts, 4, MPIU_INT, MPI_SUM, comm));
+  PetscInt counts[3] = {end - begin, bad, foreign};
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, counts, 3, MPIU_INT, MPI_SUM, comm));
   PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &volume, 1, MPIU_REAL, MPI_SUM, comm));
   PetscCallMPI(MPI_Allreduce(&worst, &global, 1, MPI_DOUBLE_INT, MPI_MINLOC, comm));
   PetscCallMPI(MPI_Bcast(centre, 3, MPIU_REAL, global.rank, comm));
@@ -302,9 +327,6 @@ PetscErrorCode Mesh::check_cells(const Options &options)
   PulmoUserCheck(counts[2] == 0, comm,
                  "-dm_plex_filename %s holds %d cells that are not tetrahedra; mesh with tetrahedra only",
                  file_.c_str(), static_cast<int>(counts[2]));
-  PulmoUserCheck(counts[3] == 0, comm,
-                 "-dm_plex_filename %s holds elements of higher order; save it with straight ones (gmsh -order 1)",
-                 file_.c_str());
   PulmoUserCheck(counts[1] == 0, comm,
                  "-dm_plex_filename %s holds %d inverted or degenerate cells, the worst at (%.6g, %.6g, %.6g) mm with "
                  "volume / (longest edge)^3 = %.2g; mesh anew or optimise the mesh in gmsh",

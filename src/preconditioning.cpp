@@ -227,7 +227,17 @@ PetscErrorCode setup_p_multigrid(PC pc)
     PetscCall(update_single_blocks(self->single, B));
   else if (self->use_single && block_size == 3)
     PetscCall(create_single_blocks(B, &self->single));
-  if (self->single) A = B = self->single;
+  if (self->single) {
+    PC smooth;
+    PetscBool fits;
+    PetscCall(KSPSetFromOptions(smoother));
+    PetscCall(KSPGetPC(smoother, &smooth));
+    PetscCall(PetscObjectTypeCompareAny((PetscObject)smooth, &fits, PCSOR, PCJACOBI, PCNONE, ""));
+    PulmoUserCheck(fits, comm,
+                   "-pmg_single smooths by sor, jacobi or none: change -fieldsplit_displacement_pmg_levels_pc_type or "
+                   "add -fieldsplit_displacement_pmg_single off");
+    A = B = self->single;
+  }
   PetscCall(KSPSetOperators(smoother, A, B));
   PetscCall(PCSetOperators(self->mg, A, B));
   PetscCall(PCSetUp(self->mg));
@@ -277,7 +287,8 @@ PetscErrorCode p_multigrid_options(PC pc, PetscOptionItems *PetscOptionsObject)
 PetscErrorCode view_p_multigrid(PC pc, PetscViewer viewer)
 {
   PetscFunctionBeginUser;
-  PetscCall(PetscViewerASCIIPrintf(viewer, "  P2 displacement above P1\n"));
+  const bool single = static_cast<PMultigrid *>(pc->data)->single;
+  PetscCall(PetscViewerASCIIPrintf(viewer, "  P2 displacement above P1%s\n", single ? ", P2 in single precision" : ""));
   if (auto *mg = static_cast<PMultigrid *>(pc->data)->mg) PetscCall(PCView(mg, viewer));
   PetscFunctionReturn(PETSC_SUCCESS);
 }

@@ -97,15 +97,14 @@ PetscErrorCode Predictor::improve(SNES snes, const std::function<PetscErrorCode(
     PetscCall(VecAXPY(foreseen_, -along, s));
     ++n;
   }
+  if (known_ == 0 && std::isfinite(norm)) PetscCall(SNESSetInitialFunction(snes, residual_));
   if (n == 0) PetscFunctionReturn(PETSC_SUCCESS);
   PetscCall(residual_norm(snes, X, foreseen_, guess_norm));
   PetscCall(PetscInfo(snes, "residual %g at the last state, %g at the guess\n", (double)norm, (double)guess_norm));
-  if (guess_norm < norm) {
+  if (guess_norm < norm)
     PetscCall(SNESSetInitialFunction(snes, foreseen_));
-  } else {
-    PetscCall(VecCopy(start_, X));
-    PetscCall(SNESSetInitialFunction(snes, residual_));
-  }
+  else
+    PetscCall(VecCopy(start_, X)); // evaluated once more: whoever evaluates may keep what goes with the last state seen
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -223,6 +223,7 @@ PetscErrorCode Simulation::create_solver()
   PetscCall(TSSetMaxSteps(ts_, PETSC_MAX_INT));
   PetscCall(TSSetExactFinalTime(ts_, TS_EXACTFINALTIME_MATCHSTEP));
   PetscCall(TSSetMaxSNESFailures(ts_, -1));
+  PetscCall(TSSetMaxStepRejections(ts_, -1)); // reject() knows when to give up
   PetscCall(TSSetErrorIfStepFails(ts_, PETSC_FALSE));
   PetscCall(TSSetPreStage(ts_, pre_stage));
   PetscCall(TSSetPostStage(ts_, post_stage));
@@ -242,7 +243,9 @@ PetscErrorCode Simulation::create_solver()
   PetscCall(TSSetFromOptions(ts_));
   PetscCall(offer_fixed_stress(ksp));
   PetscCall(lagging_.setup(snes));
-  PetscCall(SNESSetConvergenceTest(snes, newton_converged, this, nullptr));
+  if (lagging_.in_use() || predictor_.in_use() ||
+      (scene_.facts().ventilator && scene_.facts().ventilator->prescribes_flow()))
+    PetscCall(SNESSetConvergenceTest(snes, newton_converged, this, nullptr));
   if (scene_.facts().common_pressure()) {
     SNESLineSearch search;
     PetscBool newton;
@@ -474,9 +477,12 @@ PetscErrorCode Simulation::guess(SNES snes, Vec X)
   PetscFunctionBeginUser;
   PetscCall(airway_.guess(X));
   if (!predictor_.in_use()) PetscFunctionReturn(PETSC_SUCCESS);
-  PetscCall(predictor_.improve(
-      snes, [this](Vec d) { return airway_.mode() == Airway::Mode::held ? model_.set_airway_nodes(d, 0) : 0; }, X,
-      start_norm_));
+  const auto hold = [this](Vec increment) -> PetscErrorCode {
+    PetscFunctionBeginUser;
+    if (airway_.mode() == Airway::Mode::held) PetscCall(model_.set_airway_nodes(increment, 0));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  };
+  PetscCall(predictor_.improve(snes, hold, X, start_norm_));
   inverted_ = false; // a guess was tried, no more
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -486,8 +492,10 @@ PetscErrorCode Simulation::converged(SNES snes, PetscInt it, PetscReal xnorm, Pe
 {
   PetscFunctionBeginUser;
   PetscCall(SNESConvergedDefault(snes, it, xnorm, ynorm, fnorm, reason, nullptr));
-  // -snes_rtol is relative to the start of the step, however good the guess
-  if (it == 0 && predictor_.in_use()) snes->ttol = std::max(snes->ttol, snes->rtol * start_norm_);
+  if (it == 0 && predictor_.in_use()) { // tolerances are relative to the start of the step, however good the guess
+    snes->ttol = std::max(snes->ttol, snes->rtol * start_norm_);
+    snes->rnorm0 = std::max(snes->rnorm0, start_norm_);
+  }
   lagging_.judge(snes, it, fnorm);
   if (*reason > 0 && !airway_.satisfied() && extra_newton_++ < max_extra_newton) *reason = SNES_CONVERGED_ITERATING;
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -518,15 +526,10 @@ PetscErrorCode Simulation::after_stage()
   krylov_ += krylov;
   if (reason < 0) {
     PetscReal dt;
-    bool again;
     PetscCall(TSGetTimeStep(ts_, &dt));
-    PetscCall(lagging_.retry(snes, again));
-    if (again) {
-      PetscCall(keep_step(dt));
-    } else {
-      PetscCall(lagging_.settle(snes));
-      PetscCall(reject(dt, SNESConvergedReasons[reason], newton, inverted_measures_, inverted_));
-    }
+    // where the start itself is not defined new Jacobians are no help
+    const bool retry = newton > 0 || reason != SNES_DIVERGED_FUNCTION_DOMAIN;
+    PetscCall(fail(dt, SNESConvergedReasons[reason], newton, inverted_measures_, inverted_, retry));
   }
   inverted_ = false;
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -536,11 +539,8 @@ PetscErrorCode Simulation::accept_stage(Vec X, PetscBool *accept)
 {
   Measures measures;
   PetscReal t, dt;
-  SNES snes;
 
   PetscFunctionBeginUser;
-  PetscCall(TSGetSNES(ts_, &snes));
-  PetscCall(lagging_.settle(snes));
   PetscCall(TSGetTime(ts_, &t));
   PetscCall(TSGetTimeStep(ts_, &dt));
   PetscCall(airway_.apply(X));
@@ -548,7 +548,7 @@ PetscErrorCode Simulation::accept_stage(Vec X, PetscBool *accept)
   PetscCall(model_.constrain(t + dt, local_));
   PetscCall(model_.measure(local_, measures));
   *accept = PetscBool(measures.min_J > 0);
-  if (!*accept) PetscCall(reject(dt, "converged to a state with J <= 0", 0, measures, true));
+  if (!*accept) PetscCall(fail(dt, "converged to a state with J <= 0", 0, measures, true, true));
   if (*accept) {
     PetscReal pressure;
     PetscCall(airway_.pressure(local_, pressure));
@@ -567,8 +567,29 @@ PetscErrorCode Simulation::keep_step(PetscReal dt)
   TSAdapt adapt;
 
   PetscFunctionBeginUser;
+  PetscCall(TSRestartStep(ts_)); // as in reject()
   PetscCall(TSGetAdapt(ts_, &adapt));
   PetscCall(TSSetTimeStep(ts_, dt / adapt->scale_solve_failed));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// An attempt failed: the step is taken again, with new Jacobians throughout if @p retry and there were old ones, else
+/// shorter.
+PetscErrorCode Simulation::fail(PetscReal dt, const std::string &reason, PetscInt newton, const Measures &measures,
+                                bool inverted, bool retry)
+{
+  SNES snes;
+  bool again = false;
+
+  PetscFunctionBeginUser;
+  PetscCall(TSGetSNES(ts_, &snes));
+  if (retry) PetscCall(lagging_.retry(snes, again));
+  if (again) {
+    airway_.again();
+    PetscCall(keep_step(dt));
+  } else {
+    PetscCall(reject(dt, reason, newton, measures, inverted));
+  }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -596,10 +617,13 @@ PetscErrorCode Simulation::after_step()
   PetscReal t, pressure;
   SignalRow row;
   TSConvergedReason reason;
+  SNES snes;
 
   PetscFunctionBeginUser;
   PetscCall(TSGetConvergedReason(ts_, &reason));
   if (reason < 0) PetscFunctionReturn(PETSC_SUCCESS); // PETSc calls this after a step that it gave up, too
+  PetscCall(TSGetSNES(ts_, &snes));
+  PetscCall(lagging_.settle(snes));
   PetscCall(TSGetTime(ts_, &t));
   row.dt = t - accepted_.time;
   cut_ = false;

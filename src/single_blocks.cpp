@@ -2,6 +2,7 @@
 
 #include <petsc/private/petscimpl.h>
 
+#include <cmath>
 #include <utility>
 #include <vector>
 
@@ -10,7 +11,7 @@ namespace pulmo {
 namespace {
 
 /// Four floats of which three count: a column of a block, the vector of a node.
-typedef float Vector4 __attribute__((vector_size(16), aligned(4), may_alias));
+typedef float FloatVector __attribute__((vector_size(16), aligned(4), may_alias));
 
 constexpr PetscInt block_size = 9;  ///< floats of a block, stored by columns
 constexpr PetscInt vector_size = 4; ///< floats of a node's vector, the last one without meaning
@@ -27,22 +28,22 @@ struct Blocks {
   void close_row() { begin.push_back(static_cast<PetscInt>(column.size())); }
 };
 
-Vector4 &at(NodeVectors &x, PetscInt node)
+FloatVector &at(NodeVectors &x, PetscInt node)
 {
-  return *reinterpret_cast<Vector4 *>(&x[vector_size * node]);
+  return *reinterpret_cast<FloatVector *>(&x[vector_size * node]);
 }
 
 /// B x
-Vector4 times(const float *B, Vector4 x)
+FloatVector times(const float *B, FloatVector x)
 {
-  const auto column = [B](int j) { return *reinterpret_cast<const Vector4 *>(B + 3 * j); };
+  const auto column = [B](int j) { return *reinterpret_cast<const FloatVector *>(B + 3 * j); };
   return column(0) * x[0] + column(1) * x[1] + column(2) * x[2];
 }
 
 /// r - sum over the blocks of row @p node times x
-Vector4 subtract(const Blocks &blocks, PetscInt node, NodeVectors &x, Vector4 r)
+FloatVector subtract(const Blocks &blocks, PetscInt node, NodeVectors &x, FloatVector r)
 {
-  Vector4 other = {0, 0, 0, 0}; // two sums, so that one need not wait for the other
+  FloatVector other = {0, 0, 0, 0}; // two sums, so that one need not wait for the other
   const PetscInt end = blocks.begin[node + 1];
   PetscInt k = blocks.begin[node];
   for (; k + 1 < end; k += 2) {
@@ -53,7 +54,7 @@ Vector4 subtract(const Blocks &blocks, PetscInt node, NodeVectors &x, Vector4 r)
   return r - other;
 }
 
-/// The inverse of a 3 x 3 matrix.
+/// The inverse of a 3 x 3 matrix; zero for a singular one, whose node the smoother then leaves alone.
 void invert(const float *a, float *inverse)
 {
   const double A[9] = {a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7], a[8]};
@@ -61,7 +62,10 @@ void invert(const float *a, float *inverse)
                               A[6] * A[5] - A[3] * A[8], A[0] * A[8] - A[6] * A[2], A[3] * A[2] - A[0] * A[5],
                               A[3] * A[7] - A[6] * A[4], A[6] * A[1] - A[0] * A[7], A[0] * A[4] - A[3] * A[1]};
   const double determinant = A[0] * cofactor[0] + A[3] * cofactor[1] + A[6] * cofactor[2];
-  for (int i = 0; i < 9; ++i) inverse[i] = static_cast<float>(cofactor[i] / determinant);
+  for (int i = 0; i < 9; ++i) {
+    const auto entry = static_cast<float>(cofactor[i] / determinant);
+    inverse[i] = std::isfinite(entry) ? entry : 0;
+  }
 }
 
 struct SingleBlocks {
@@ -100,6 +104,7 @@ PetscErrorCode for_each_block(Mat A, const Function &block)
 
   PetscFunctionBeginUser;
   PetscCall(MatGetRowIJ(A, 0, PETSC_FALSE, PETSC_FALSE, &rows, &i, &j, &done));
+  PetscCheck(done, PETSC_COMM_SELF, PETSC_ERR_SUP, "the matrix does not show its rows");
   PetscCall(MatSeqAIJGetArrayRead(A, &a));
   for (PetscInt row = 0; row < rows; row += 3) {
     const PetscInt length = i[row + 1] - i[row];
@@ -163,7 +168,7 @@ PetscErrorCode residual(Mat single, Vec b, Vec x, Vec r)
   PetscCall(to_single(b, self->r));
   PetscCall(subtract_foreign(*self, x, self->r));
   for (PetscInt node = 0; node < self->nodes; ++node) {
-    Vector4 sum = at(self->r, node) - times(&self->diagonal[block_size * node], at(self->x, node));
+    FloatVector sum = at(self->r, node) - times(&self->diagonal[block_size * node], at(self->x, node));
     sum = subtract(self->lower, node, self->x, sum);
     at(self->r, node) = subtract(self->upper, node, self->x, sum);
   }
@@ -204,11 +209,12 @@ PetscErrorCode sweep(Mat single, Vec b, PetscReal omega, MatSORType type, PetscR
 
   PetscFunctionBeginUser;
   PetscCall(MatShellGetContext(single, &self));
-  PetscCheck(omega == 1 && shift == 0 && !(type & ~(forward | backward | SOR_ZERO_INITIAL_GUESS)),
-             PetscObjectComm((PetscObject)single), PETSC_ERR_SUP,
-             "single precision smooths by plain Gauss-Seidel sweeps: no -pc_sor_omega, shift or Eisenstat");
+  PulmoUserCheck(omega == 1 && shift == 0 && !(type & ~(forward | backward | SOR_ZERO_INITIAL_GUESS)),
+                 PetscObjectComm((PetscObject)single),
+                 "-pmg_single smooths by plain Gauss-Seidel sweeps: leave out -..._pmg_levels_pc_sor_omega and "
+                 "-..._pc_sor_diagonal_shift, or add -fieldsplit_displacement_pmg_single off");
   if (!zero) PetscCall(to_single(x, self->x));
-  const auto solve = [self](PetscInt node, Vector4 r) {
+  const auto solve = [self](PetscInt node, FloatVector r) {
     at(self->x, node) = times(&self->inverse[block_size * node], r);
   };
   for (PetscInt it = 0; it < iterations; ++it) {
@@ -217,7 +223,7 @@ PetscErrorCode sweep(Mat single, Vec b, PetscReal omega, MatSORType type, PetscR
     for (PetscInt local = 0; local < local_iterations; ++local, zero = false) {
       if (type & forward) {
         for (PetscInt node = 0; node < self->nodes; ++node) {
-          const Vector4 r = at(self->r, node) = subtract(self->lower, node, self->x, at(self->b, node));
+          const FloatVector r = at(self->r, node) = subtract(self->lower, node, self->x, at(self->b, node));
           solve(node, zero ? r : subtract(self->upper, node, self->x, r));
         }
         if (type & backward)
@@ -225,7 +231,7 @@ PetscErrorCode sweep(Mat single, Vec b, PetscReal omega, MatSORType type, PetscR
             solve(node, subtract(self->upper, node, self->x, at(self->r, node)));
       } else {
         for (PetscInt node = self->nodes; node-- > 0;) {
-          const Vector4 r = subtract(self->upper, node, self->x, at(self->b, node));
+          const FloatVector r = subtract(self->upper, node, self->x, at(self->b, node));
           solve(node, zero ? r : subtract(self->lower, node, self->x, r));
         }
       }

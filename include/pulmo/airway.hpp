@@ -27,6 +27,8 @@ public:
   void begin_phase(const Phase &phase, PetscReal volume);
   /// Begins an attempt at a step of size @p dt that ends at @p t, s.
   void begin_step(PetscReal t, PetscReal dt);
+  /// The attempt at hand failed and is made once more, as it was.
+  void again() { retake_ = limited_; }
   /// Puts the prescribed pressure, or the last known one, into a global vector.
   PetscErrorCode guess(Vec X) const;
   /// Hands the step to the model; where P is an unknown its value is that of @p X.

@@ -8,7 +8,7 @@ namespace pulmo {
 
 /// Completes PETSc's `-snes_lag_jacobian N` and `-snes_lag_preconditioner N`, which make new ones after N Newton steps:
 /// a Newton step that left too much of the residual brings new ones at once, and a step in time that failed with old
-/// ones is tried again, as long as it was, with new ones in every Newton step. Does nothing where nothing lags.
+/// ones is tried again, as long as it was, with new ones in every Newton step. Does nothing unless an N is above 1.
 class Lagging {
 public:
   /// Declares -newton_refresh.
@@ -18,9 +18,9 @@ public:
 
   /// After Newton step @p it (0: before the first one) with residual norm @p norm.
   void judge(SNES snes, PetscInt it, PetscReal norm);
-  /// An attempt failed. True if the same step is to be tried again.
+  /// An attempt failed. @p again: the same step is to be tried once more; nothing lags then until settle().
   PetscErrorCode retry(SNES snes, bool &again);
-  /// An attempt was accepted, or the step was cut.
+  /// A step was accepted.
   PetscErrorCode settle(SNES snes);
 
 private:

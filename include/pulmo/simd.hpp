@@ -7,6 +7,9 @@ namespace pulmo {
 /// Four doubles, at any address of a double: the components of a node, or four entries of a row.
 typedef double Vector4 __attribute__((vector_size(32), aligned(8), may_alias));
 
+/// Nodes of the largest element whose components are gathered into vectors.
+constexpr int max_nodes = 32;
+
 /// Eight: the components of a node, then their rates.
 typedef double Vector8 __attribute__((vector_size(64)));
 

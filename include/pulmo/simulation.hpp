@@ -96,6 +96,8 @@ private:
   PetscReal landing(PetscReal t) const;
   PetscErrorCode scatter(PetscReal t, Vec X, Vec Xdot);
   PetscErrorCode keep_step(PetscReal dt);
+  PetscErrorCode fail(PetscReal dt, const std::string &reason, PetscInt newton, const Measures &measures, bool inverted,
+                      bool retry);
   /// Notes an attempt that failed; ends the run if the next one would be too short.
   PetscErrorCode reject(PetscReal dt, const std::string &reason, PetscInt newton, const Measures &measures,
                         bool inverted);

@@ -99,7 +99,7 @@ PetscErrorCode measure(const char *type, PetscInt repeats, Result &result, Petsc
   PetscCall(VecDuplicate(local, result.vector.out()));
   PetscCall(smooth_state(run, local, rate));
   PetscCall(model.set_step(dt, 0.3));
-  PetscCall(DMCreateMatrix(model.dm(), result.matrix.out()));
+  PetscCall(model.create_matrix(result.matrix.out()));
   std::vector<double> seconds;
   PetscCall(median_seconds(repeats,
                            {[&] { return model.residual(dt, local, rate, result.vector); },

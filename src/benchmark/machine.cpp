@@ -5,6 +5,8 @@
 //   mpiexec -n N pulmo_machine_benchmark [megabytes per array, default 128]
 //
 // Prints one JSON object, rates in 10^9 per second.
+#include "pulmo/simd.hpp"
+
 #include <mpi.h>
 
 #include <algorithm>
@@ -15,11 +17,11 @@
 
 namespace {
 
+using pulmo::Vector4;
+
 constexpr int repeats = 10;
 
-/// The vectors of the kernels of integration.cpp: four doubles.
-constexpr int lanes = 4;
-typedef double Vector4 __attribute__((vector_size(32), aligned(8), may_alias));
+constexpr int lanes = 4; // of the vectors of integration.cpp
 
 double sink = 0; // what is computed ends here, so that it is computed
 

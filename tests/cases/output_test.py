@@ -434,7 +434,7 @@ class OtherScenes(unittest.TestCase):
 class Help(unittest.TestCase):
     # contract: option and unit (None: none of its own)
     OPTIONS = {
-        "-mesh_scale": "-",
+        "-mesh_scale": "-", "-predictor_increments": "-", "-newton_refresh": "-",
         "-tissue": None, "-tissue_mu": "kPa", "-tissue_lambda": "kPa", "-tissue_phi0": "-",
         "-tissue_a": "-", "-tissue_b": "-", "-tissue_c": "kPa", "-tissue_beta": "-", "-tissue_c1": "kPa",
         "-tissue_c3": "kPa", "-tissue_d1": "-", "-tissue_d3": "-", "-tissue_c_q": "kPa", "-tissue_c_c": "kPa",

@@ -19,7 +19,7 @@ from .assembly import LAWS
 from .common import SCENES, SOURCE, blas, fail, processor, write_table
 from .strategies import measure, solver_words
 
-NEW = ["-snes_lag_jacobian", "1", "-snes_lag_preconditioner", "1", "-snes_ksp_ew", "0", "-ksp_rtol", "1e-5",
+NEW = ["-predictor_increments", "0", "-snes_lag_jacobian", "1", "-snes_lag_preconditioner", "1", "-snes_ksp_ew", "0", "-ksp_rtol", "1e-5",
        "-ksp_converged_reason", "-progress", "on"]
 # what a phase takes from another: flows are those of the pressure phase, the released pressure that of the stretch
 PHASES = {"pressure": None, "flow": "pressure", "common": "pressure", "stretch": "pressure", "release": "stretch"}
