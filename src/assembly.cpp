@@ -1,4 +1,5 @@
 #include "pulmo/assembly.hpp"
+
 #include "pulmo/simd.hpp"
 
 #include <algorithm>

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <numeric>
+#include <petsc/private/dmimpl.h>
 #include <utility>
 #include <vector>
 
@@ -267,9 +268,12 @@ PetscErrorCode create_matrix(DM dm, Mat *A)
     PetscFunctionReturn(PETSC_SUCCESS);
   }
   Pattern pattern;
+  PetscCall(
+      PetscLogEventBegin(DM_CreateMatrix, dm, nullptr, nullptr, nullptr)); // -log_view has it under the usual name
   PetscCall(pattern.setup(dm));
   PetscCall(pattern.allocate(*A));
   PetscCall(pattern.fill(*A));
+  PetscCall(PetscLogEventEnd(DM_CreateMatrix, dm, nullptr, nullptr, nullptr));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -223,11 +223,9 @@ PetscErrorCode setup_p_multigrid(PC pc)
   PetscCall(PCMGGetCoarseSolve(self->mg, &coarse));
   PetscCall(KSPSetOperators(coarse, self->coarse, self->coarse));
   PetscCall(PCMGGetSmoother(self->mg, 1, &smoother));
-  if (self->single)
-    PetscCall(update_single_blocks(self->single, B));
-  else if (self->use_single && block_size == 3)
-    PetscCall(create_single_blocks(B, &self->single));
   if (self->single) {
+    PetscCall(update_single_blocks(self->single, B));
+  } else if (self->use_single && block_size == 3) {
     PC smooth;
     PetscBool fits;
     PetscCall(KSPSetFromOptions(smoother));
@@ -236,8 +234,9 @@ PetscErrorCode setup_p_multigrid(PC pc)
     PulmoUserCheck(fits, comm,
                    "-pmg_single smooths by sor, jacobi or none: change -fieldsplit_displacement_pmg_levels_pc_type or "
                    "add -fieldsplit_displacement_pmg_single off");
-    A = B = self->single;
+    PetscCall(create_single_blocks(B, &self->single));
   }
+  if (self->single) A = B = self->single;
   PetscCall(KSPSetOperators(smoother, A, B));
   PetscCall(PCSetOperators(self->mg, A, B));
   PetscCall(PCSetUp(self->mg));

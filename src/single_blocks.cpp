@@ -25,7 +25,14 @@ struct Blocks {
   std::vector<float> value;       ///< [block][column][row], and room to load a vector from the last column
 
   void allocate() { value.assign(block_size * column.size() + 1, 0); }
-  void close_row() { begin.push_back(static_cast<PetscInt>(column.size())); }
+  /// Appends a block to a row; rows come in order.
+  void add(PetscInt node, PetscInt block_column)
+  {
+    close_rows(node);
+    column.push_back(block_column);
+  }
+  /// The rows before @p node are complete.
+  void close_rows(PetscInt node) { begin.resize(node + 1, static_cast<PetscInt>(column.size())); }
 };
 
 FloatVector &at(NodeVectors &x, PetscInt node)
@@ -274,18 +281,9 @@ PetscErrorCode create_single_blocks(Mat A, Mat *single)
 
   PetscCall(parts(A, &owned, &foreign, &columns));
   self->nodes = rows / 3;
-  PetscInt last = 0;
   PetscCall(for_each_block(owned, [&](PetscInt node, PetscInt column, const PetscScalar *, PetscInt) {
-    for (; last < node; ++last) {
-      self->lower.close_row();
-      self->upper.close_row();
-    }
-    if (column != node) (column < node ? self->lower : self->upper).column.push_back(column);
+    if (column != node) (column < node ? self->lower : self->upper).add(node, column);
   }));
-  for (; last < self->nodes; ++last) {
-    self->lower.close_row();
-    self->upper.close_row();
-  }
   for (NodeVectors *v : {&self->x, &self->b, &self->r}) v->assign(vector_size * self->nodes, 0);
   self->diagonal.assign(block_size * self->nodes + 1, 0);
   self->inverse.assign(block_size * self->nodes + 1, 0);
@@ -293,12 +291,9 @@ PetscErrorCode create_single_blocks(Mat A, Mat *single)
     PetscInt ghosts;
     IS from;
     Vec x;
-    last = 0;
     PetscCall(for_each_block(foreign, [&](PetscInt node, PetscInt column, const PetscScalar *, PetscInt) {
-      for (; last < node; ++last) self->foreign.close_row();
-      self->foreign.column.push_back(column);
+      self->foreign.add(node, column);
     }));
-    for (; last < self->nodes; ++last) self->foreign.close_row();
     PetscCall(MatGetLocalSize(foreign, nullptr, &ghosts));
     PetscCall(ISCreateGeneral(PETSC_COMM_SELF, ghosts, columns, PETSC_USE_POINTER, &from));
     PetscCall(VecCreateSeq(PETSC_COMM_SELF, ghosts, self->ghost_values.out()));
@@ -308,7 +303,10 @@ PetscErrorCode create_single_blocks(Mat A, Mat *single)
     PetscCall(ISDestroy(&from));
     self->ghosts.assign(vector_size * (ghosts / 3), 0);
   }
-  for (Blocks *blocks : {&self->lower, &self->upper, &self->foreign}) blocks->allocate();
+  for (Blocks *blocks : {&self->lower, &self->upper, &self->foreign}) {
+    blocks->close_rows(self->nodes);
+    blocks->allocate();
+  }
   PetscCall(update_single_blocks(*single, A));
   PetscFunctionReturn(PETSC_SUCCESS);
 }

@@ -9,7 +9,7 @@ import subprocess
 from pathlib import Path
 
 from . import plots, runs
-from .common import SCENES, SOLVERS, SOURCE, blas, environment, fail, processor, write_table
+from .common import SCENES, SOLVERS, SOURCE, blas, environment, fail, processor, require, write_table
 from .strategies import measure, mesh_sentence, solver_words
 
 PEER = Path(__file__).parent / "peer_fenics.py"
@@ -87,10 +87,7 @@ def scaled(seconds, peer, reference, newton):
 
 
 def run(options):
-    if not (options.build / "pulmo").exists():
-        fail(f"{options.build} holds no build; run tools/setup first")
-    if not options.mesh.is_file():
-        fail(f"there is no mesh {options.mesh}")
+    require(options.build, [options.mesh])
     if options.repeat < 1 or (options.peer_steps is not None and options.peer_steps < 1):
         fail("--repeat and --peer-steps must be at least 1")
     if abs(options.time / DT - round(options.time / DT)) > 1e-9 or not 0 < options.time <= 3:

@@ -9,6 +9,7 @@ from pathlib import Path
 SOURCE = Path(__file__).resolve().parent.parent.parent
 SCENES = SOURCE / "petsc_options/scenes"
 SOLVERS = SOURCE / "petsc_options/solvers"
+PLAIN = "-predictor_increments 0 -snes_lag_jacobian 1 -snes_lag_preconditioner 1"  # Newton's method with nothing spared
 
 
 def fail(message):
@@ -37,6 +38,15 @@ def environment():
     """One BLAS thread; Open MPI may run as root in containers."""
     return dict(os.environ, OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1", OMPI_ALLOW_RUN_AS_ROOT="1",
                 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM="1")
+
+
+def require(build, meshes):
+    """Ends the program unless `build` holds pulmo and all `meshes` are files."""
+    if not (build / "pulmo").exists():
+        fail(f"{build} holds no build; run tools/setup first")
+    for mesh in meshes:
+        if not mesh.is_file():
+            fail(f"there is no mesh {mesh}")
 
 
 def make_lung(cells, build):

@@ -7,14 +7,10 @@ factors over that step (`-snes_lag_jacobian -2`): more factorisations need the s
 import math
 from pathlib import Path
 
-import matplotlib
-
-from . import runs
-from .common import SCENES, SOURCE, fail, make_lung, processor, write_table
+from . import plots, runs
+from .common import SCENES, SOURCE, make_lung, processor, require, write_table
+from .plots import plt
 from .strategies import measure, solver_words
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 
 ENTRIES = ["@direct -snes_lag_jacobian -2 -snes_rtol 1e-3", "@iterative"]
 STEP = 0.05  # s
@@ -84,18 +80,11 @@ def draw(path, title, points):
     axis.set_ylabel("peak memory, sum of ranks (MB)")
     axis.grid(True, which="both", alpha=0.3)
     axis.legend(fontsize=8)
-    axis.set_title(title, fontsize=10)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-    print(f"wrote {path}")
+    plots.save(figure, path, title)
 
 
 def run(options):
-    if not (options.build / "pulmo").exists():
-        fail(f"{options.build} holds no build; run tools/setup first")
-    for mesh in options.mesh or []:
-        if not mesh.is_file():
-            fail(f"there is no mesh {mesh}")
+    require(options.build, options.mesh or [])
     meshes = options.mesh or [make_lung(cells, options.build) for cells in options.cells]
     flags = options.flags or ENTRIES
     entries = {entry: solver_words(entry) for entry in flags}

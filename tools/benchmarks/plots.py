@@ -10,6 +10,14 @@ import matplotlib.pyplot as plt
 COLOURS = {"setup": "#9a9a9a", "residual": "#e0a83a", "jacobian": "#3b7d4f", "solve": "#2f6c9e", "output": "#b5403a"}
 
 
+def save(figure, path, title):
+    """Gives a figure its title and writes it."""
+    figure.suptitle(title, fontsize=10)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    print(f"wrote {path}")
+
+
 def krylov_of_steps(result):
     """Times and Krylov iterations per Newton step of each time step."""
     path = result["folder"] / "run/signals.csv"
@@ -59,10 +67,7 @@ def side_by_side(path, title, entries):
     krylov.set_ylim(bottom=0)
     if krylov.lines:
         krylov.legend(fontsize=7, ncols=2)
-    figure.suptitle(title, fontsize=10)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-    print(f"wrote {path}")
+    save(figure, path, title)
 
 
 def counts(path, title, entries):
@@ -95,7 +100,4 @@ def counts(path, title, entries):
     handles += [plt.Line2D([], [], color="k", lw=0, marker=markers[j % len(markers)], label=f"Δt {step} s")
                 for j, step in enumerate(steps)]
     axes[0][-1].legend(handles=handles, loc="upper left", bbox_to_anchor=(1.02, 1), fontsize=7, frameon=False)
-    figure.suptitle(title, fontsize=10)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-    print(f"wrote {path}")
+    save(figure, path, title)

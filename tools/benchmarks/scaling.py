@@ -13,15 +13,12 @@ import shlex
 import statistics
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 
 from . import plots, runs
-from .common import SCENES, SOURCE, blas, fail, make_lung, markdown, processor, show, write_csv, write_table
+from .common import PLAIN, SCENES, SOURCE, blas, fail, make_lung, markdown, processor, require, show, write_csv, write_table
+from .plots import plt
 from .strategies import solver_words
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 
 COUNTS = ("messages", "bytes", "reductions")
 HEADER = ["mesh", "tetrahedra", "dofs", "ranks", "steps", "Newton", "Krylov", "setup s", "residual s/step", "Jacobian s/step",
@@ -303,15 +300,10 @@ def draw(path, title, table, predictions, options):
     for axis in (growth, model):
         axis.grid(True, which="both", alpha=0.3)
         axis.legend(fontsize=8)
-    figure.suptitle(title, fontsize=10)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-    print(f"wrote {path}")
+    plots.save(figure, path, title)
 
 
 def run(options):
-    if not (options.build / "pulmo").exists():
-        fail(f"{options.build} holds no build; run tools/setup first")
     if len(options.flags) > 1:
         fail("scaling takes one string of flags after --")
     if options.ranks[0] != 1:
@@ -320,10 +312,8 @@ def run(options):
         fail("--repeat and all ranks must be at least 1, --predict-ranks at least 2")
     if max(options.ranks + options.count_ranks) == 1:
         fail("the model needs a run on several ranks: --ranks 1 2, or --count-ranks 4")
-    for mesh in options.mesh or []:
-        if not mesh.is_file():
-            fail(f"there is no mesh {mesh}")
-    flags = options.flags[0] if options.flags else "@iterative"
+    require(options.build, options.mesh or [])
+    flags = options.flags[0] if options.flags else f"@iterative {PLAIN}"
     meshes = options.mesh or [make_lung(cells, options.build) for cells in options.cells]
     measured, cuts, table = {}, {}, []
     for mesh in meshes:

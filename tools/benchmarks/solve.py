@@ -16,11 +16,10 @@ from pathlib import Path
 
 from . import plots, runs
 from .assembly import LAWS
-from .common import SCENES, SOURCE, blas, fail, processor, write_table
+from .common import PLAIN, SCENES, SOURCE, blas, fail, processor, require, write_table
 from .strategies import measure, solver_words
 
-NEW = ["-predictor_increments", "0", "-snes_lag_jacobian", "1", "-snes_lag_preconditioner", "1", "-snes_ksp_ew", "0", "-ksp_rtol", "1e-5",
-       "-ksp_converged_reason", "-progress", "on"]
+NEW = [*PLAIN.split(), "-snes_ksp_ew", "0", "-ksp_rtol", "1e-5", "-ksp_converged_reason", "-progress", "on"]
 # what a phase takes from another: flows are those of the pressure phase, the released pressure that of the stretch
 PHASES = {"pressure": None, "flow": "pressure", "common": "pressure", "stretch": "pressure", "release": "stretch"}
 # mean J to which a lung without springs inflates with a regular tangent: yoshihara has a limit point at 2.53, birzle is
@@ -128,11 +127,7 @@ def run(options):
     flags = options.flags or ["@iterative"]
     meshes = options.mesh or [SOURCE / "meshes/lung_test.msh", SOURCE / "meshes/lung_pair.msh"]
     words = {f: solver_words(f) for f in flags}
-    for mesh in meshes:
-        if not mesh.is_file():
-            fail(f"there is no mesh {mesh}")
-    if not (options.build / "pulmo").exists():
-        fail(f"{options.build} holds no build; run tools/setup first")
+    require(options.build, meshes)
     if options.steps < 1 or options.ranks < 1:
         fail("--steps and --ranks must be at least 1")
     if options.stretch is not None and options.stretch <= 1:

@@ -4,7 +4,7 @@ import statistics
 from pathlib import Path
 
 from . import plots, runs
-from .common import SCENES, SOLVERS, SOURCE, blas, fail, processor, write_table
+from .common import SCENES, SOLVERS, SOURCE, blas, fail, processor, require, write_table
 
 HEADER = ["flags", "outcome", "steps", "rejected", "Newton", "Krylov", "Krylov/Newton", "wall s", *(f"{s} s" for s in runs.STAGES),
           "CPU s", "memory MB", "volume difference", "pressure difference", "remark"]
@@ -97,10 +97,7 @@ def run(options):
         fail("a string of flags is given twice; --repeat measures again")
     if options.repeat < 1 or options.ranks < 1:
         fail("--repeat and --ranks must be at least 1")
-    if not options.mesh.is_file():
-        fail(f"there is no mesh {options.mesh}")
-    if not (options.build / "pulmo").exists():
-        fail(f"{options.build} holds no build; run tools/setup first")
+    require(options.build, [options.mesh])
     scenes = [scene_file(name) for name in options.scene]
     common = ["-dm_plex_filename", options.mesh]
     for path in scenes:
