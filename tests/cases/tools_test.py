@@ -12,7 +12,7 @@ import numpy as np
 import pulmo_case as pulmo
 
 sys.path.insert(0, os.path.join(pulmo.SOURCE, "tools"))
-from benchmarks import assembly, memory, operations, scaling  # noqa: E402
+from benchmarks import assembly, common, memory, operations, scaling  # noqa: E402
 
 
 def tool(name, *arguments):
@@ -181,7 +181,8 @@ class Tools(unittest.TestCase):
         first = benchmark(*few)
         self.assertEqual(first.returncode, 0, first.stdout + first.stderr)
         one, two = table(os.path.join(folder, "scaling.csv"))
-        twin = pulmo.finished(pulmo.options_file("solvers/iterative.opts") + pulmo.PCV + pulmo.CUBE + ["-ts_max_time", "0.05"]).json()
+        twin = pulmo.finished(pulmo.options_file("solvers/iterative.opts") + common.PLAIN.split() + pulmo.PCV + pulmo.CUBE
+                              + ["-ts_max_time", "0.05"]).json()
         self.assertEqual([int(one[key]) for key in ("dofs", "Newton", "Krylov")],
                          [twin[key] for key in ("dofs", "newton_iterations", "krylov_iterations")])
         self.assertEqual((one["ranks"], one["messages/rank/step"], one["efficiency"]), ("1", "0", "1.00"))
