@@ -186,6 +186,13 @@ PetscErrorCode Simulation::setup()
   PetscCall(create_solver());
   phases_ = phases();
   end_ = phases_.back().end;
+  dt_ = wanted_dt_;
+  for (Phase &phase : phases_) {
+    phase_ = &phase;
+    // a jump of pressure takes the first step: where that one has to be cut, the jump is cut with it
+    if (phase.control == Control::pressure && phase.ramp == 0) phase.ramp = landing(phase.begin);
+  }
+  phase_ = nullptr;
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -89,11 +89,14 @@ class Stability(unittest.TestCase):
         self.assertAlmostEqual(below.signals()["max_J"][-1], J, places=5)
 
     def test_steps_are_cut_and_grow_back(self):
-        """The whole pressure in the first step is too much for the default step; later the step asked for returns."""
-        for options in (["-tissue", "rausch", "-ventilator_pip", "40", "-ventilator_ramp", "0"],
-                        ["-tissue", "berger", "-ventilator_pip", "20"]):
-            with self.subTest(options=" ".join(options)):
-                case = pulmo.finished(pulmo.DIRECT + pulmo.PCV + pulmo.CUBE + QUIET + options + ["-ts_max_time", "0.3"])
+        """The whole pressure in the first step is too much for the default step; later the step asked for returns.
+
+        A jump is cut with the first step: it is a rise of pressure within that step.
+        """
+        for law, pip, ramp in ("rausch", 40, 0), ("berger", 20, 0.1):
+            with self.subTest(law):
+                case = pulmo.finished(pulmo.DIRECT + pulmo.PCV + pulmo.CUBE + QUIET + [
+                    "-tissue", law, "-ventilator_pip", pip, "-ventilator_ramp", ramp, "-ts_max_time", "0.3"])
                 self.assert_sound(case, "signals.csv", "summary.json")
                 rows, summary = case.signals(), case.json()
                 dt, time = rows["dt_s"][1:], rows["time_s"]
@@ -106,6 +109,8 @@ class Stability(unittest.TestCase):
                 np.testing.assert_allclose(np.diff(time), dt, rtol=1e-9)
                 self.assertEqual(summary["steps"], len(dt))
                 self.assertAlmostEqual(time[-1], 0.3)
+                np.testing.assert_allclose(rows["airway_pressure_cmH2O"], pip * np.minimum(1, time / (ramp or 0.05)),
+                                           rtol=1e-9)
 
 
 if __name__ == "__main__":

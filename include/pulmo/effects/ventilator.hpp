@@ -70,7 +70,7 @@ public:
     PetscCall(options.real("ramp", "s", Range::not_negative(),
                            "rise of pressure (vcv, default 0: of flow) at the start of inspiration", ramp_));
     PetscCall(options.real("ramp_down", "s", Range::not_negative(),
-                           "fall of pressure at the start of expiration (0: from the first step)", ramp_down_));
+                           "fall of pressure at the start of expiration (0: within the first step)", ramp_down_));
     options.group(name(), "all but programme", pcv || vcv || syringe, "-ventilator pcv, vcv or supersyringe");
     PetscCall(options.real("inspiration", "s", Range::positive(),
                            "duration of inspiration (supersyringe, default 0.3: of the flow of a step)", inspiration_));
