@@ -14,11 +14,12 @@ constexpr PetscReal volume_tolerance = 1e-10;
 
 } // namespace
 
-void Airway::begin_phase(const Phase &phase, PetscReal volume)
+void Airway::begin_phase(const Phase &phase, PetscReal volume, PetscReal first_step)
 {
   phase_ = phase;
   if (!phase_.from) phase_.from = ventilator_before_;
-  volume_begin_ = volume_before_ = volume;
+  volume_begin_ = volume;
+  first_step_ = first_step;
   limited_ = limited_before_ = retake_ = false;
 }
 
@@ -33,7 +34,7 @@ PetscErrorCode Airway::persist(Archive &archive)
   PetscCall(archive.value("airway/pressure_kPa", pressure_before_));
   PetscCall(archive.value("airway/ventilator_pressure_kPa", ventilator_before_));
   PetscCall(archive.value("airway/volume_at_phase_begin_mm3", volume_begin_));
-  PetscCall(archive.value("airway/volume_mm3", volume_before_));
+  PetscCall(archive.value("airway/first_step_s", first_step_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -46,16 +47,26 @@ void Airway::set_mode()
     mode_ = facts_.tube ? Mode::common : Mode::held;
 }
 
-void Airway::begin_step(PetscReal t, PetscReal dt)
+PetscReal Airway::prescribed_pressure(PetscReal t, PetscReal step_end) const
 {
-  dt_ = dt;
+  if (limited_) return *phase_.limit;
+  // a jump of pressure is there from the start; where the first step has to be cut it is cut with it
+  const PetscReal since = step_end - phase_.begin;
+  if (phase_.ramp == 0 && since < first_step_) return *phase_.from + (phase_.to - *phase_.from) * since / first_step_;
+  return phase_.value(t);
+}
+
+void Airway::begin_stage(PetscReal t, PetscReal step_end, const TimeScheme &scheme)
+{
+  slope_ = scheme.slope();
+  past_flow_ = scheme.past_flow();
   limited_ = limited_before_ || retake_; // a cut step may stay below the limit
   retake_ = false;
   set_mode();
   if (control() == Control::flow)
     volume_target_ = volume_begin_ + phase_.delivered(t);
   else
-    target_ = limited_ ? *phase_.limit : phase_.value(t);
+    target_ = prescribed_pressure(t, step_end);
   pressure_ = mode_ == Mode::held ? target_ : pressure_before_; // not what a failed attempt left
 }
 
@@ -71,7 +82,7 @@ PetscErrorCode Airway::apply(Vec X)
   PetscFunctionBeginUser;
   if (mode_ == Mode::common) PetscCall(model_.carrier_value(X, pressure_));
   model_.hold_airway(mode_ != Mode::free);
-  PetscCall(model_.set_step(dt_, pressure_, mode_ == Mode::free ? flow() : 0));
+  PetscCall(model_.set_step(1 / slope_, pressure_, mode_ == Mode::free ? flow() : 0));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -81,7 +92,7 @@ PetscErrorCode Airway::close(PetscReal volume, Vec F)
   volume_ = volume;
   PetscCall(model_.close_rows(F));
   if (mode_ == Mode::common) {
-    const PetscReal h = model_.composition().mesh().length(), Q = (volume - volume_before_) / dt_;
+    const PetscReal h = model_.composition().mesh().length(), Q = rate(volume);
     const PetscReal c = control() == Control::flow ? (volume - volume_target_) / (h * h * h)
                                                    : (ventilator_pressure(Q) - target_) / model_.modulus();
     PetscCall(model_.set_carrier_value(F, c));
@@ -92,9 +103,8 @@ PetscErrorCode Airway::close(PetscReal volume, Vec F)
 PetscReal Airway::change(PetscReal c, PetscReal c_P, PetscReal volume_fixed, PetscReal volume_per_P) const
 {
   const PetscReal h = model_.composition().mesh().length();
-  const PetscReal c_V = control() == Control::flow
-                            ? 1 / (h * h * h)
-                            : facts_.tube->slope((volume_ - volume_before_) / dt_) / (dt_ * model_.modulus());
+  const PetscReal c_V =
+      control() == Control::flow ? 1 / (h * h * h) : facts_.tube->slope(rate(volume_)) * slope_ / model_.modulus();
   return -(c + c_V * volume_fixed) / (c_P + c_V * volume_per_P);
 }
 

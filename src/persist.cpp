@@ -1,6 +1,8 @@
 // What a simulation remembers (Simulation::persist).
 #include "pulmo/simulation.hpp"
 
+#include "pulmo/units.hpp"
+
 #include <algorithm>
 #include <sstream>
 
@@ -89,6 +91,8 @@ PetscErrorCode Simulation::persist(Archive &archive)
     PetscCall(DMLocalToGlobal(model_.dm(), before_, INSERT_VALUES, state_));
     PetscCall(airway_.restore(state_));
   }
+  if (archive.reading())
+    PetscCall(scheme_.begin(model_, accepted_.time, accepted_.volume * units::mm3_per_ml, before_));
   PetscCall(predictor_.persist(archive, state_));
   for (Observer *observer : observers_) PetscCall(observer->persist(archive, before_));
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -104,7 +108,7 @@ PetscErrorCode Simulation::resume(const Archive &archive, PetscInt index, PetscR
                  accepted_.time, (double)end_);
   PetscCall(archive.check(index >= 0 && index < static_cast<PetscInt>(phases_.size()), "phase"));
   phase_ = &phases_[static_cast<std::size_t>(index)];
-  airway_.begin_phase(*phase_, 0);
+  airway_.begin_phase(*phase_, 0, 0);
   if (wanted_dt != wanted_dt_) dt_ = wanted_dt_;
   if (wanted_dt != wanted_dt_ || phase_end != phase_->end) next_dt_ = landing(accepted_.time);
   resumed_ = true;

@@ -147,7 +147,7 @@ PetscErrorCode run(const Registry &registry, bool &finished)
   options.group("effects", "ledger");
   PetscCall(options.flag("view", "print effects, fields, terms, blocks and seconds at the end", view_effects));
   options.group("energy", "energy balance");
-  PetscCall(options.flag("audit", "follow the energy balance over the steps (energy.csv)", audit_energy));
+  PetscCall(options.flag("audit", "follow the energy balance over the steps (energy.csv; backward Euler)", audit_energy));
   PetscCall(PetscOptionsHasHelp(nullptr, &help));
   PetscCall(PetscOptionsHasName(nullptr, nullptr, "-dm_plex_filename", &has_mesh));
   if (help) PetscCall(options.print_help());
@@ -167,6 +167,7 @@ PetscErrorCode run(const Registry &registry, bool &finished)
   Sampling sampling;
   RegionAudit regions(scene, run.model(), sampling);
   EnergyAudit energy(scene, run.model(), sampling);
+  if (simulation.scheme().multistep()) audit_energy = false; // the balance is that of backward Euler
   const Audits audits{regions, audit_energy ? &energy : nullptr};
   PetscCall(sampling.setup(run.model()));
   PetscCall(regions.setup());

@@ -124,13 +124,13 @@ PetscErrorCode post_step(TS ts)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode check_stage(TSAdapt, TS ts, PetscReal, Vec X, PetscBool *accept)
+PetscErrorCode check_stage(TSAdapt, TS ts, PetscReal t, Vec X, PetscBool *accept)
 {
   Simulation *simulation;
 
   PetscFunctionBeginUser;
   PetscCall(simulation_of(ts, &simulation));
-  PetscCall(simulation->accept_stage(X, accept));
+  PetscCall(simulation->accept_stage(t, X, accept));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -186,13 +186,6 @@ PetscErrorCode Simulation::setup()
   PetscCall(create_solver());
   phases_ = phases();
   end_ = phases_.back().end;
-  dt_ = wanted_dt_;
-  for (Phase &phase : phases_) {
-    phase_ = &phase;
-    // a jump of pressure takes the first step: where that one has to be cut, the jump is cut with it
-    if (phase.control == Control::pressure && phase.ramp == 0) phase.ramp = landing(phase.begin);
-  }
-  phase_ = nullptr;
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -205,7 +198,7 @@ PetscErrorCode Simulation::create_solver()
   TSAdapt adapt;
   PetscReal max_time;
   PetscInt max_steps;
-  PetscBool own_control, is_beuler, has_pc, is_fieldsplit = PETSC_FALSE, is_lu = PETSC_FALSE;
+  PetscBool own_control, has_pc, is_fieldsplit = PETSC_FALSE, is_lu = PETSC_FALSE;
   char pc_type[64] = "";
 
   PetscFunctionBeginUser;
@@ -283,9 +276,7 @@ PetscErrorCode Simulation::create_solver()
   PetscCall(PetscObjectTypeCompare((PetscObject)adapt, "pulmo", &own_control));
   PulmoUserCheck(own_control, comm, "-ts_adapt_type: pulmo cuts, regrows and lands steps itself; leave the option out");
   PulmoUserCheck(max_time > 0, comm, "-ts_max_time %g s leaves nothing to run; it must be positive", (double)max_time);
-  PetscCall(PetscObjectTypeCompare((PetscObject)(TS)ts_, TSBEULER, &is_beuler));
-  PulmoUserCheck(is_beuler, comm,
-                 "-ts_type: the conservative rate of porosity is exact for backward Euler only; use -ts_type beuler");
+  PetscCall(scheme_.setup(ts_, local_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -363,6 +354,7 @@ PetscErrorCode Simulation::start()
   if (phases_.front().control == Control::pressure) // a run begins with all at rest, or with a pressure of its own
     accepted_.pressure = phases_.front().from.value_or(0) / units::kPa_per_cmH2O;
   accepted_.ventilator_pressure = accepted_.pressure;
+  PetscCall(scheme_.begin(model_, 0, measures.volume_change, before_));
   PetscCall(report(accepted_, measures));
   dt_ = wanted_dt_;
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -385,12 +377,13 @@ PetscErrorCode Simulation::run(bool &finished)
     if (within && same(accepted_.time, phase.end)) continue;
     phase_ = &phase;
     if (!within) {
-      airway_.begin_phase(phase, accepted_.volume * units::mm3_per_ml);
+      airway_.begin_phase(phase, accepted_.volume * units::mm3_per_ml, std::min(wanted_dt_, phase.end - phase.begin));
       next_dt_ = landing(phase.begin);
     }
     PetscCall(TSSetTime(ts_, within ? accepted_.time : phase.begin));
     PetscCall(TSSetMaxTime(ts_, phase.end));
     PetscCall(TSSetTimeStep(ts_, next_dt_));
+    PetscCall(TSRestartStep(ts_)); // no scheme may look back beyond the kink
     PetscCall(TSSolve(ts_, state_));
     PetscCall(TSGetConvergedReason(ts_, &reason));
     if (reason < 0 || stopped_) {
@@ -407,27 +400,45 @@ PetscErrorCode Simulation::run(bool &finished)
 
 PetscErrorCode Simulation::before_stage(PetscReal t)
 {
-  PetscReal dt;
+  PetscReal begin, dt;
 
   PetscFunctionBeginUser;
+  PetscCall(TSGetTime(ts_, &begin));
   PetscCall(TSGetTimeStep(ts_, &dt));
-  airway_.begin_step(t, dt);
+  PetscCall(scheme_.begin_stage(t, dt));
+  airway_.begin_stage(t, begin + dt, scheme_);
   extra_newton_ = 0;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Fills rate_ from local_ as the kernels want it: backward Euler's, or the share of the present (TimeScheme).
+PetscErrorCode Simulation::make_rate()
+{
+  PetscFunctionBeginUser;
+  if (scheme_.multistep()) {
+    PetscCall(VecAXPBY(rate_, scheme_.slope(), 0, local_));
+  } else {
+    PetscCall(VecWAXPY(rate_, -1, before_, local_));
+    PetscCall(VecScale(rate_, scheme_.slope()));
+  }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
 /// Fills local_ and rate_ from global vectors at time t.
 PetscErrorCode Simulation::scatter(PetscReal t, Vec X, Vec Xdot)
 {
-  PetscReal dt;
-
   PetscFunctionBeginUser;
-  PetscCall(TSGetTimeStep(ts_, &dt));
   PetscCall(airway_.apply(X));
   PetscCall(DMGlobalToLocal(model_.dm(), X, INSERT_VALUES, local_));
-  PetscCall(DMGlobalToLocal(model_.dm(), Xdot, INSERT_VALUES, rate_));
   PetscCall(model_.constrain(t, local_));
-  PetscCall(model_.constrain_rate(local_, before_, dt, rate_));
+  if (scheme_.multistep()) {
+    PetscCall(make_rate());
+  } else {
+    PetscReal dt;
+    PetscCall(TSGetTimeStep(ts_, &dt));
+    PetscCall(DMGlobalToLocal(model_.dm(), Xdot, INSERT_VALUES, rate_));
+    PetscCall(model_.constrain_rate(local_, before_, dt, rate_));
+  }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -448,6 +459,7 @@ PetscErrorCode Simulation::residual(PetscReal t, Vec X, Vec Xdot, Vec F)
     PetscFunctionReturn(PETSC_SUCCESS);
   }
   PetscCall(model_.residual(t, local_, rate_, local_residual_));
+  PetscCall(scheme_.add_past(model_, local_residual_));
   PetscCall(VecZeroEntries(F));
   PetscCall(DMLocalToGlobal(model_.dm(), local_residual_, ADD_VALUES, F));
   PetscCall(airway_.close(measures.volume_change, F));
@@ -496,6 +508,7 @@ PetscErrorCode Simulation::border(SNES snes, Vec X, Vec Y)
 PetscErrorCode Simulation::guess(SNES snes, Vec X)
 {
   PetscFunctionBeginUser;
+  if (scheme_.multistep()) PetscCall(VecCopy(state_, X)); // PETSc extrapolates: tolerances would tighten as dt falls
   PetscCall(airway_.guess(X));
   if (!predictor_.in_use()) PetscFunctionReturn(PETSC_SUCCESS);
   const auto hold = [this](Vec increment) -> PetscErrorCode {
@@ -528,6 +541,8 @@ PetscErrorCode Simulation::jacobian(PetscReal t, Vec X, Vec Xdot, PetscReal shif
 
   PetscFunctionBeginUser;
   PetscCall(scatter(t, X, Xdot));
+  PetscCheck(std::abs(shift - scheme_.slope()) <= 1e-8 * shift, options_.comm(), PETSC_ERR_PLIB,
+             "TS has slope %g, pulmo %g", (double)shift, (double)scheme_.slope());
   PetscCall(model_.jacobian(t, local_, rate_, shift, A));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -556,27 +571,28 @@ PetscErrorCode Simulation::after_stage()
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Simulation::accept_stage(Vec X, PetscBool *accept)
+PetscErrorCode Simulation::accept_stage(PetscReal t, Vec X, PetscBool *accept)
 {
   Measures measures;
-  PetscReal t, dt;
+  PetscReal dt;
 
   PetscFunctionBeginUser;
-  PetscCall(TSGetTime(ts_, &t));
   PetscCall(TSGetTimeStep(ts_, &dt));
   PetscCall(airway_.apply(X));
   PetscCall(DMGlobalToLocal(model_.dm(), X, INSERT_VALUES, local_));
-  PetscCall(model_.constrain(t + dt, local_));
+  PetscCall(model_.constrain(t, local_));
   PetscCall(model_.measure(local_, measures));
   *accept = PetscBool(measures.min_J > 0);
   if (!*accept) PetscCall(fail(dt, "converged to a state with J <= 0", 0, measures, true, true));
   if (*accept) {
     PetscReal pressure;
     PetscCall(airway_.pressure(local_, pressure));
-    const PetscReal flow = (measures.volume_change - accepted_.volume * units::mm3_per_ml) / dt;
-    if (airway_.limit(flow)) { // the step is taken again, as long as it was: a shorter one would let the flow overshoot
+    if (airway_.limit(scheme_.flow(measures.volume_change))) { // the step is taken again, as long as it was: a shorter
+                                                               // one would let the flow overshoot
       PetscCall(keep_step(dt));
       *accept = PETSC_FALSE;
+    } else {
+      PetscCall(scheme_.accept_stage(model_, t, measures.volume_change, local_));
     }
   }
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -661,13 +677,15 @@ PetscErrorCode Simulation::after_step()
   PetscCall(DMGlobalToLocal(model_.dm(), state_, INSERT_VALUES, local_));
   PetscCall(model_.constrain(t, local_));
   PetscCall(airway_.pressure(local_, pressure));
-  PetscCall(VecWAXPY(rate_, -1, before_, local_));
-  PetscCall(VecScale(rate_, 1 / row.dt));
+  PetscCall(make_rate());
   PetscCall(model_.measure(local_, measures));
   row.volume = measures.volume_change / units::mm3_per_ml;
   const bool free = airway_.mode() == Airway::Mode::free, airflow = scene_.facts().airflow,
              supported = model_.composition().supported();
-  if ((airflow && !free) || supported) PetscCall(model_.residual(t, local_, rate_, local_residual_));
+  if ((airflow && !free) || supported) {
+    PetscCall(model_.residual(t, local_, rate_, local_residual_));
+    PetscCall(scheme_.add_past(model_, local_residual_));
+  }
   if (supported) {
     std::vector<std::array<PetscReal, 3>> forces;
     PetscCall(model_.reactions(local_residual_, forces));
@@ -681,10 +699,10 @@ PetscErrorCode Simulation::after_step()
     PetscCall(model_.airway_flow(local_residual_, flow));
     row.flow = flow / units::mm3_per_ml;
   } else {
-    row.flow = (row.volume - accepted_.volume) / row.dt;
+    row.flow = scheme_.flow(measures.volume_change) / units::mm3_per_ml;
   }
   PetscCall(VecCopy(local_, before_));
-  airway_.accept(measures.volume_change, row.flow * units::mm3_per_ml);
+  airway_.accept(row.flow * units::mm3_per_ml);
   row.time = t;
   row.pressure = pressure / units::kPa_per_cmH2O;
   row.ventilator_pressure = airway_.ventilator_pressure(row.flow * units::mm3_per_ml) / units::kPa_per_cmH2O;
@@ -696,7 +714,10 @@ PetscErrorCode Simulation::after_step()
   row.min_J = measures.min_J;
   row.max_J = measures.max_J;
   newton_ = krylov_ = 0;
-  delivered_ += row.dt * row.flow * units::mm3_per_ml;
+  const PetscReal lost = scheme_.flow(measures.volume_change) - row.flow * units::mm3_per_ml;
+  delivered_ += (row.volume - accepted_.volume) * units::mm3_per_ml - lost / scheme_.slope();
+  PetscCall(scheme_.accept(model_, t, measures.volume_change, local_));
+  if (same(t, phase_->begin + phase_->ramp)) PetscCall(TSRestartStep(ts_)); // a kink
   accepted_ = row;
   PetscCall(report(row, measures));
   if (crawled_ == crawling_steps) PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));

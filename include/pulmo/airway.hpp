@@ -4,7 +4,7 @@
 #pragma once
 
 #include "pulmo/archive.hpp"
-#include "pulmo/model.hpp"
+#include "pulmo/time_scheme.hpp"
 
 namespace pulmo {
 
@@ -23,9 +23,9 @@ public:
 
   Airway(Model &model, const SceneFacts &facts) : model_(model), facts_(facts) {}
 
-  /// Begins a phase at lung volume @p volume (mm^3 above rest). A ramp of pressure without a start value starts from
-  /// what the ventilator has then.
-  void begin_phase(const Phase &phase, PetscReal volume);
+  /// Begins a phase at lung volume @p volume (mm^3 above rest) whose first step is to take @p first_step s. A ramp of
+  /// pressure without a start value starts from what the ventilator has then.
+  void begin_phase(const Phase &phase, PetscReal volume, PetscReal first_step);
   /// Writes or reads what a step needs of the phase and of the steps before it; the phase was begun.
   PetscErrorCode persist(Archive &archive);
   /// After persist() has read: puts a gas pressure that has no node into a global vector.
@@ -33,8 +33,9 @@ public:
   {
     return model_.composition().common_gas_pressure() ? model_.set_carrier_value(X, pressure_before_) : PETSC_SUCCESS;
   }
-  /// Begins an attempt at a step of size @p dt that ends at @p t, s.
-  void begin_step(PetscReal t, PetscReal dt);
+  /// Begins an attempt at a stage that ends at @p t, of a step that ends at @p step_end, s. @p scheme: where rates of
+  /// volume come from.
+  void begin_stage(PetscReal t, PetscReal step_end, const TimeScheme &scheme);
   /// The attempt at hand failed and is made once more, as it was.
   void again() { retake_ = limited_; }
   /// Puts the prescribed pressure, or the last known one, into a global vector.
@@ -48,10 +49,9 @@ public:
   PetscReal change(PetscReal c, PetscReal c_P, PetscReal volume_fixed, PetscReal volume_per_P) const;
   /// Whether the volume of a flow phase was met when close() was called last.
   bool satisfied() const;
-  /// Takes note of an accepted step with flow @p flow (mm^3/s) that ended at @p volume, mm^3.
-  void accept(PetscReal volume, PetscReal flow)
+  /// Takes note of an accepted step with flow @p flow, mm^3/s.
+  void accept(PetscReal flow)
   {
-    volume_before_ = volume;
     pressure_before_ = pressure_;
     ventilator_before_ = ventilator_pressure(flow);
     limited_before_ = limited_;
@@ -71,25 +71,30 @@ public:
 
   Mode mode() const { return mode_; }
   /// Flow prescribed in the step at hand, mm^3/s.
-  PetscReal flow() const { return (volume_target_ - volume_before_) / dt_; }
+  PetscReal flow() const { return rate(volume_target_); }
 
 private:
   /// What the phase prescribes: after its limit was reached a pressure.
   Control control() const { return limited_ ? Control::pressure : phase_.control; }
   void set_mode();
+  /// The pressure that the phase prescribes, kPa.
+  PetscReal prescribed_pressure(PetscReal t, PetscReal step_end) const;
+  /// Rate of volume at the end of the stage if that ends at @p volume, mm^3/s.
+  PetscReal rate(PetscReal volume) const { return slope_ * volume + past_flow_; }
 
   Model &model_;
   const SceneFacts &facts_;
   Phase phase_;
   Mode mode_ = Mode::held;
-  bool limited_ = false, limited_before_ = false;  ///< the limit is held now, was held in the step before
-  bool retake_ = false;                            ///< the next attempt is the first one with the limit held
-  PetscReal pressure_ = 0, pressure_before_ = 0;   ///< at the airway now, before the step, kPa
-  PetscReal ventilator_before_ = 0;                ///< at the ventilator before the step, kPa
-  PetscReal target_ = 0;                           ///< pressure that the phase prescribes, kPa
-  PetscReal volume_begin_ = 0, volume_before_ = 0; ///< at the begin of the phase, of the step, mm^3
-  PetscReal volume_target_ = 0, volume_ = 0;       ///< prescribed; at the last close(), mm^3
-  PetscReal dt_ = 1;
+  bool limited_ = false, limited_before_ = false; ///< the limit is held now, was held in the step before
+  bool retake_ = false;                           ///< the next attempt is the first one with the limit held
+  PetscReal pressure_ = 0, pressure_before_ = 0;  ///< at the airway now, before the step, kPa
+  PetscReal ventilator_before_ = 0;               ///< at the ventilator before the step, kPa
+  PetscReal target_ = 0;                          ///< pressure that the phase prescribes, kPa
+  PetscReal volume_begin_ = 0;                    ///< at the begin of the phase, mm^3
+  PetscReal volume_target_ = 0, volume_ = 0;      ///< prescribed; at the last close(), mm^3
+  PetscReal slope_ = 1, past_flow_ = 0;           ///< of rate(): 1/s, mm^3/s
+  PetscReal first_step_ = 0;                      ///< of the phase, s
 };
 
 } // namespace pulmo

@@ -78,6 +78,7 @@ public:
   PetscReal support_reaction() const { return worst_reaction_; } ///< largest force component of the run, kPa mm^2
   PetscInt rejected_steps() const { return rejected_; }
   const StageSeconds &seconds() const { return seconds_; }
+  const TimeScheme &scheme() const { return scheme_; }
   /// One paragraph on a run that could not go on: where, when, what was tried, what to try.
   std::string failure_text() const;
 
@@ -93,7 +94,7 @@ public:
   PetscErrorCode converged(SNES snes, PetscInt it, PetscReal xnorm, PetscReal ynorm, PetscReal fnorm,
                            SNESConvergedReason *reason);
   PetscErrorCode after_stage();
-  PetscErrorCode accept_stage(Vec X, PetscBool *accept);
+  PetscErrorCode accept_stage(PetscReal t, Vec X, PetscBool *accept);
   PetscErrorCode after_step();
   /// Next step size after an accepted one of size @p h that ends at @p t: grows back after cuts.
   PetscReal next_step(PetscReal t, PetscReal h, PetscReal growth);
@@ -112,6 +113,7 @@ private:
   bool same(PetscReal t, PetscReal other) const;
   /// Step size from time @p t, shortened to land on the end of the ramp or of the phase.
   PetscReal landing(PetscReal t) const;
+  PetscErrorCode make_rate();
   PetscErrorCode scatter(PetscReal t, Vec X, Vec Xdot);
   PetscErrorCode keep_step(PetscReal dt);
   PetscErrorCode fail(PetscReal dt, const std::string &reason, PetscInt newton, const Measures &measures, bool inverted,
@@ -126,6 +128,7 @@ private:
   const Scene &scene_;
   Model &model_;
   Airway airway_;
+  TimeScheme scheme_;
   Predictor predictor_;
   Lagging lagging_;
   std::vector<Observer *> observers_;

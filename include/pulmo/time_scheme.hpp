@@ -1,0 +1,61 @@
+/// @file
+/// The rate of what is conserved (gas, volume) in the stage at hand, as PETSc's TS makes the rate of the state.
+#pragma once
+
+#include "pulmo/model.hpp"
+
+#include <array>
+
+namespace pulmo {
+
+/// Keeps the past that a rate is made of: dy/dt = slope y + sum w_i y_i (LeVeque 2007, Finite Difference Methods for
+/// Ordinary and Partial Differential Equations, section 8.6; weights for any step sizes from Lagrange's polynomials).
+///
+/// -ts_type beuler   y_0, the state before the step. The kernels make dJ/dt themselves (effects/airflow.hpp).
+/// -ts_type bdf      order 2: the last two states; after a restart PETSc makes half a step with backward Euler first,
+/// and
+///                   y_1 is the state there. The kernels are asked for slope (J - 1) alone; the past is kept as
+///                   int (J_i - 1) q, so that gas is conserved to rounding.
+class TimeScheme {
+public:
+  /// Reads the type off @p ts and refuses those whose rate is not conservative here. @p like: a local vector.
+  PetscErrorCode setup(TS ts, Vec like);
+  bool multistep() const { return multistep_; }
+
+  /// Begins with the state @p local of volume @p volume (mm^3 above rest) at time @p t.
+  PetscErrorCode begin(Model &model, PetscReal t, PetscReal volume, Vec local);
+  /// Begins a stage that ends at time @p t of a step of size @p dt, s.
+  PetscErrorCode begin_stage(PetscReal t, PetscReal dt);
+  /// Takes note of the solution of the stage at hand if it is the half step of a restart.
+  PetscErrorCode accept_stage(Model &model, PetscReal t, PetscReal volume, Vec local);
+  /// Takes note of an accepted step.
+  PetscErrorCode accept(Model &model, PetscReal t, PetscReal volume, Vec local);
+
+  PetscReal slope() const { return slope_; } ///< 1/s
+  /// The share of the past in the rate of volume, mm^3/s.
+  PetscReal past_flow() const;
+  /// Rate of volume at @p volume, mm^3/s.
+  PetscReal flow(PetscReal volume) const { return slope_ * volume + past_flow(); }
+  /// Adds the share of the past to the mass rows of a local residual of @p model.
+  PetscErrorCode add_past(const Model &model, Vec residual) const;
+
+private:
+  struct Past {
+    PetscReal time = 0, volume = 0; ///< s, mm^3
+    VecHandle gas;                  ///< local: int (J - 1) q in the mass rows, mm^3
+  };
+
+  /// Fills @p past with the state @p local.
+  PetscErrorCode keep(Model &model, PetscReal t, PetscReal volume, Vec local, Past &past);
+
+  TS ts_ = nullptr;
+  bool multistep_ = false, gas_ = false; ///< BDF; and there is a mass balance
+  bool half_ = false;                    ///< the stage at hand is the half step of a restart
+  Past last_, earlier_, middle_;
+  std::array<const Past *, 2> used_{};
+  std::array<PetscReal, 2> weight_{};
+  PetscReal slope_ = 1;
+  VecHandle zero_;
+};
+
+} // namespace pulmo

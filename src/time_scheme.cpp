@@ -1,0 +1,122 @@
+#include "pulmo/time_scheme.hpp"
+
+#include <petsc/private/tsimpl.h>
+
+namespace pulmo {
+
+PetscErrorCode TimeScheme::setup(TS ts, Vec like)
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)ts);
+  PetscBool euler, bdf;
+  PetscInt order = 2, fields;
+  DM dm;
+
+  PetscFunctionBeginUser;
+  ts_ = ts;
+  PetscCall(PetscObjectTypeCompare((PetscObject)ts, TSBEULER, &euler));
+  PetscCall(PetscObjectTypeCompare((PetscObject)ts, TSBDF, &bdf));
+  PulmoUserCheck(euler || bdf, comm,
+                 "-ts_type: gas is conserved by backward Euler and BDF2 only; use -ts_type beuler "
+                 "or -ts_type bdf");
+  if (bdf) PetscCall(TSBDFGetOrder(ts, &order));
+  PulmoUserCheck(order == 2, comm, "-ts_bdf_order %d: of the BDF methods only order 2 is there; leave the option out",
+                 (int)order);
+  multistep_ = bdf;
+  PetscCall(TSGetDM(ts, &dm));
+  PetscCall(DMGetNumFields(dm, &fields));
+  gas_ = multistep_ && fields > pressure;
+  if (!gas_) PetscFunctionReturn(PETSC_SUCCESS);
+  for (Past *past : {&last_, &earlier_, &middle_}) PetscCall(VecDuplicate(like, past->gas.out()));
+  PetscCall(VecDuplicate(like, zero_.out()));
+  PetscCall(VecZeroEntries(zero_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode TimeScheme::keep(Model &model, PetscReal t, PetscReal volume, Vec local, Past &past)
+{
+  PetscSection section;
+  VecHandle rest;
+  PetscInt begin, end;
+
+  PetscFunctionBeginUser;
+  past.time = t;
+  past.volume = volume;
+  if (!gas_) PetscFunctionReturn(PETSC_SUCCESS);
+  // with dt = 1 s and the state as its own rate the kernels integrate J - 1, and what does not depend on the rate
+  PetscCall(VecDuplicate(past.gas, rest.out()));
+  PetscCall(model.set_step(1, 0));
+  PetscCall(model.residual(t, local, local, past.gas));
+  PetscCall(model.residual(t, local, zero_, rest));
+  PetscCall(VecAXPY(past.gas, -1, rest));
+  PetscCall(VecScale(past.gas, 1 / model.row_scale(pressure)));
+  PetscCall(DMGetLocalSection(model.dm(), &section));
+  WriteArray g(past.gas);
+  PetscCall(PetscSectionGetChart(section, &begin, &end));
+  for (PetscInt p = begin; p < end; ++p) {
+    PetscInt dofs, offset;
+    PetscCall(PetscSectionGetFieldDof(section, p, displacement, &dofs));
+    PetscCall(PetscSectionGetFieldOffset(section, p, displacement, &offset));
+    for (PetscInt d = 0; d < dofs; ++d) g[offset + d] = 0;
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode TimeScheme::begin(Model &model, PetscReal t, PetscReal volume, Vec local)
+{
+  PetscFunctionBeginUser;
+  PetscCall(keep(model, t, volume, local, last_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode TimeScheme::begin_stage(PetscReal t, PetscReal dt)
+{
+  const PetscReal from = last_.time;
+
+  PetscFunctionBeginUser;
+  half_ = multistep_ && ts_->steprestart && t - from < 0.75 * dt;
+  used_ = {&last_, nullptr};
+  if (!multistep_ || half_) {
+    slope_ = 1 / (multistep_ ? t - from : dt);
+    weight_ = {-slope_, 0};
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+  used_[1] = ts_->steprestart ? &middle_ : &earlier_;
+  const PetscReal a = t - from, b = t - used_[1]->time;
+  slope_ = 1 / a + 1 / b;
+  weight_ = {-b / (a * (b - a)), a / (b * (b - a))};
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode TimeScheme::accept_stage(Model &model, PetscReal t, PetscReal volume, Vec local)
+{
+  PetscFunctionBeginUser;
+  if (half_) PetscCall(keep(model, t, volume, local, middle_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode TimeScheme::accept(Model &model, PetscReal t, PetscReal volume, Vec local)
+{
+  PetscFunctionBeginUser;
+  std::swap(last_, earlier_);
+  PetscCall(keep(model, t, volume, local, last_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscReal TimeScheme::past_flow() const
+{
+  PetscReal sum = 0;
+  for (std::size_t i = 0; i < used_.size(); ++i)
+    if (used_[i]) sum += weight_[i] * used_[i]->volume;
+  return sum;
+}
+
+PetscErrorCode TimeScheme::add_past(const Model &model, Vec residual) const
+{
+  PetscFunctionBeginUser;
+  if (!gas_) PetscFunctionReturn(PETSC_SUCCESS);
+  for (std::size_t i = 0; i < used_.size(); ++i)
+    if (used_[i]) PetscCall(VecAXPY(residual, weight_[i] * model.row_scale(pressure), used_[i]->gas));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace pulmo
