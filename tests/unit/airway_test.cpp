@@ -9,6 +9,33 @@ namespace {
 
 using Mode = Airway::Mode;
 
+/// An airway with the rates of backward Euler, steps of 0.05 s asked for.
+class EulerAirway : public Airway {
+public:
+  explicit EulerAirway(SceneRun &run) : Airway(run.model(), run.scene().facts()), model_(run.model()) {}
+  void begin_phase(const Phase &phase, PetscReal volume)
+  {
+    Airway::begin_phase(phase, volume, 0.05);
+    PULMO_OK(scheme_.begin(model_, phase.begin, volume, nullptr));
+  }
+  void begin_step(PetscReal t, PetscReal dt)
+  {
+    PULMO_OK(scheme_.begin_stage(t, dt));
+    begin_stage(t, t, scheme_);
+    t_ = t;
+  }
+  void accept(PetscReal volume, PetscReal flow)
+  {
+    PULMO_OK(scheme_.accept(model_, t_, volume, nullptr));
+    Airway::accept(flow);
+  }
+
+private:
+  Model &model_;
+  TimeScheme scheme_;
+  PetscReal t_ = 0;
+};
+
 /// A scene on the coarse cube, airway at x1.
 SceneSpec breathing(const std::string &mode, bool airflow, bool tube = false)
 {
@@ -62,7 +89,7 @@ TEST(Airway, ModesFollowControlSplitAndTube)
     const Registry registry = Registry::standard();
     SceneRun run(registry);
     PULMO_OK(prepare(run, scene.options()));
-    Airway airway(run.model(), run.scene().facts());
+    EulerAirway airway(run);
     airway.begin_phase(pressure_phase(0, 1, 0.4), 0);
     airway.begin_step(0.1, 0.1);
     EXPECT_EQ(airway.mode(), scene.tube ? Mode::common : Mode::held);
@@ -73,12 +100,31 @@ TEST(Airway, ModesFollowControlSplitAndTube)
   }
 }
 
+TEST(Airway, AJumpOfPressureIsCutWithTheFirstStep)
+{
+  const Registry registry = Registry::standard();
+  SceneRun run(registry);
+  VecHandle X;
+  PetscReal P;
+  PULMO_OK(prepare(run, breathing("pcv", true).options()));
+  PULMO_OK(DMCreateGlobalVector(run.model().dm(), X.out()));
+  EulerAirway airway(run);
+  Phase phase = pressure_phase(2, 3, 0.8);
+  phase.from = 0.4;
+  for (const auto &[dt, expected] : {std::pair(0.05, 0.8), {0.0125, 0.5}, {0.025, 0.6}, {0.5, 0.8}}) {
+    airway.begin_phase(phase, 0);
+    airway.begin_step(2 + dt, dt);
+    PULMO_OK(airway.pressure(X, P));
+    EXPECT_NEAR(P, expected, 1e-13) << dt;
+  }
+}
+
 TEST(Airway, FlowMakesUpForWhatEarlierStepsLeft)
 {
   const Registry registry = Registry::standard();
   SceneRun run(registry);
   PULMO_OK(prepare(run, breathing("vcv", true).options()));
-  Airway airway(run.model(), run.scene().facts());
+  EulerAirway airway(run);
   const Phase phase = flow_phase(1, 2, 300);
   const double begin = 17;
   double volume = begin, t = 1;
@@ -101,7 +147,7 @@ TEST(Airway, TheGuessAfterAFailedAttemptIsTheLastAcceptedPressure)
   PetscReal P;
   PULMO_OK(prepare(run, breathing("vcv common_pressure", true).options()));
   PULMO_OK(DMCreateGlobalVector(run.model().dm(), X.out()));
-  Airway airway(run.model(), run.scene().facts());
+  EulerAirway airway(run);
   airway.begin_phase(flow_phase(0, 1, 300), 0);
   airway.begin_step(0.1, 0.1);
   PULMO_OK(run.model().set_airway_nodes(X, 0.25));
@@ -130,7 +176,7 @@ TEST(Airway, ALimitIsHeldOnceItIsExceeded)
       const double flow = 300, drop = tube ? 3 * units::kPa_per_cmH2O * flow / 1e6 : 0; // K1 = 3 cmH2O s/l
       Phase phase = flow_phase(0, 1, flow);
       phase.limit = 0.5;
-      Airway airway(run.model(), run.scene().facts());
+      EulerAirway airway(run);
       airway.begin_phase(phase, 0);
       airway.begin_step(0.1, 0.1);
       PULMO_OK(run.model().set_airway_nodes(X, 0.5 - drop * (1 + 1e-9)));
@@ -188,7 +234,7 @@ TEST(Airway, NewtonStepOfTheScalarEquation)
       PULMO_OK(prepare(run, scene.options()));
       PULMO_OK(DMCreateGlobalVector(run.model().dm(), X.out()));
       PULMO_OK(VecDuplicate(X, F.out()));
-      Airway airway(run.model(), run.scene().facts());
+      EulerAirway airway(run);
       airway.begin_phase(flow ? flow_phase(0, 1, 0.7) : pressure_phase(0, 1, 0.8), 0.02);
       airway.begin_step(0.3, 0.05);
       // expiration as well: |Q| must not lose its sign
