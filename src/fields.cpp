@@ -131,10 +131,10 @@ PetscErrorCode FieldWriter::carry_over(const std::string &from)
   if (k < snapshots_.size())
     PetscCall(PetscPrintf(comm, "pulmo: warning: %d of %d earlier snapshots are not in %s: fields.xdmf lacks them\n",
                           static_cast<int>(snapshots_.size() - k), static_cast<int>(snapshots_.size()), from.c_str()));
+  if (!snapshots_.empty()) schedule_.skip(snapshots_.back().time);
   snapshots_.resize(k);
   if (k == 0) PetscFunctionReturn(PETSC_SUCCESS);
   mesh_ = snapshot_name(count_, "_mesh"); // other ranks number nodes otherwise
-  schedule_.skip(snapshots_.back().time);
   PetscCall(number_nodes());
   PetscCall(write_index());
   PetscFunctionReturn(PETSC_SUCCESS);
