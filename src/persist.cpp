@@ -93,6 +93,7 @@ PetscErrorCode Simulation::persist(Archive &archive)
   }
   if (archive.reading())
     PetscCall(scheme_.begin(model_, accepted_.time, accepted_.volume * units::mm3_per_ml, before_));
+  PetscCall(step_control_.persist(archive));
   PetscCall(predictor_.persist(archive, state_));
   for (Observer *observer : observers_) PetscCall(observer->persist(archive, before_));
   PetscFunctionReturn(PETSC_SUCCESS);

@@ -142,8 +142,7 @@ PetscErrorCode choose_step(TSAdapt adapt, TS ts, PetscReal h, PetscInt *next_sch
   PetscFunctionBeginUser;
   PetscCall(simulation_of(ts, &simulation));
   *next_scheme = 0;
-  *accept = PETSC_TRUE;
-  *next_h = simulation->next_step(ts->ptime + h, h, adapt->clip[1]);
+  *next_h = simulation->next_step(ts->ptime, h, *adapt, *accept);
   *wlte = *wltea = *wlter = -1; // no error is estimated
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -169,6 +168,7 @@ PetscErrorCode Simulation::declare(Options &options)
   PetscFunctionBeginUser;
   PetscCall(predictor_.declare(options));
   PetscCall(lagging_.declare(options));
+  PetscCall(step_control_.declare(options));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -330,13 +330,35 @@ PetscReal Simulation::landing(PetscReal t) const
   return dt_;
 }
 
-PetscReal Simulation::next_step(PetscReal t, PetscReal h, PetscReal growth)
+PetscReal Simulation::next_step(PetscReal t, PetscReal h, _p_TSAdapt &adapt, PetscBool &accept)
 {
-  if (cut_)
-    dt_ = h; // it took cuts to get here
-  else if (h >= dt_ * (1 - same_time))
-    dt_ = std::min(wanted_dt_, growth * dt_); // a full step: grow back
-  return landing(t);
+  accept = PETSC_TRUE;
+  if (!step_control_.in_use()) {
+    if (cut_)
+      dt_ = h; // it took cuts to get here
+    else if (h >= dt_ * (1 - same_time))
+      dt_ = std::min(wanted_dt_, adapt.clip[1] * dt_); // a full step: grow back
+    return landing(t + h);
+  }
+  const int order = scheme_.order();
+  const auto error = step_control_.error(order, candidate_, airway_.free_values());
+  const PetscReal growth = error ? StepControl::growth(order, *error) : 1,
+                  least = std::max(adapt.dt_min, least_step * wanted_dt_);
+  if (error && *error > 1 && growth * h > least) {
+    accept = PETSC_FALSE;
+    ++rejected_;
+    dt_ = growth * h;
+    return landing(t);
+  }
+  // a step that was shortened to land says little of longer ones
+  dt_ = std::min(adapt.dt_max, cut_ ? h : std::max(growth * h, h < dt_ && growth > 1 ? dt_ : 0));
+  return landing(t + h);
+}
+
+void Simulation::begin_smooth_stretch()
+{
+  step_control_.restart({accepted_.time, accepted_.volume, accepted_.pressure});
+  if (step_control_.in_use()) dt_ = wanted_dt_;
 }
 
 PetscErrorCode Simulation::start()
@@ -378,6 +400,7 @@ PetscErrorCode Simulation::run(bool &finished)
     phase_ = &phase;
     if (!within) {
       airway_.begin_phase(phase, accepted_.volume * units::mm3_per_ml, std::min(wanted_dt_, phase.end - phase.begin));
+      begin_smooth_stretch();
       next_dt_ = landing(phase.begin);
     }
     PetscCall(TSSetTime(ts_, within ? accepted_.time : phase.begin));
@@ -592,6 +615,7 @@ PetscErrorCode Simulation::accept_stage(PetscReal t, Vec X, PetscBool *accept)
       PetscCall(keep_step(dt));
       *accept = PETSC_FALSE;
     } else {
+      candidate_ = {t, measures.volume_change / units::mm3_per_ml, pressure / units::kPa_per_cmH2O};
       PetscCall(scheme_.accept_stage(model_, t, measures.volume_change, local_));
     }
   }
@@ -717,8 +741,14 @@ PetscErrorCode Simulation::after_step()
   const PetscReal lost = scheme_.flow(measures.volume_change) - row.flow * units::mm3_per_ml;
   delivered_ += (row.volume - accepted_.volume) * units::mm3_per_ml - lost / scheme_.slope();
   PetscCall(scheme_.accept(model_, t, measures.volume_change, local_));
-  if (same(t, phase_->begin + phase_->ramp)) PetscCall(TSRestartStep(ts_)); // a kink
+  step_control_.accept({t, row.volume, row.pressure});
   accepted_ = row;
+  if (same(t, phase_->begin + phase_->ramp) && !same(t, phase_->end)) {
+    begin_smooth_stretch();
+    PetscCall(TSRestartStep(ts_));
+    if (step_control_.in_use()) PetscCall(TSSetTimeStep(ts_, landing(t)));
+    PetscCall(TSGetTimeStep(ts_, &next_dt_));
+  }
   PetscCall(report(row, measures));
   if (crawled_ == crawling_steps) PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
   if (!same(t, end_)) PetscCall(heed_signal());

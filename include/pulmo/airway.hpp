@@ -4,6 +4,7 @@
 #pragma once
 
 #include "pulmo/archive.hpp"
+#include "pulmo/step_control.hpp"
 #include "pulmo/time_scheme.hpp"
 
 namespace pulmo {
@@ -70,6 +71,8 @@ public:
   bool holds_volume() const { return control() == Control::flow && phase_.to == 0 && phase_.ramp == 0; }
 
   Mode mode() const { return mode_; }
+  /// What of volume and pressure the step at hand leaves free.
+  StepControl::Free free_values() const { return {control() != Control::flow, mode_ != Mode::held}; }
   /// Flow prescribed in the step at hand, mm^3/s.
   PetscReal flow() const { return rate(volume_target_); }
 

@@ -9,7 +9,10 @@
 #include "pulmo/model.hpp"
 #include "pulmo/predictor.hpp"
 #include "pulmo/scene.hpp"
+#include "pulmo/step_control.hpp"
 #include "pulmo/stop_signal.hpp"
+
+struct _p_TSAdapt;
 
 namespace pulmo {
 
@@ -96,8 +99,9 @@ public:
   PetscErrorCode after_stage();
   PetscErrorCode accept_stage(PetscReal t, Vec X, PetscBool *accept);
   PetscErrorCode after_step();
-  /// Next step size after an accepted one of size @p h that ends at @p t: grows back after cuts.
-  PetscReal next_step(PetscReal t, PetscReal h, PetscReal growth);
+  /// Whether the step of size @p h from @p t is accepted, and the size of the one after it (or of the next attempt):
+  /// grows back after cuts, or follows the error in time.
+  PetscReal next_step(PetscReal t, PetscReal h, _p_TSAdapt &adapt, PetscBool &accept);
 
 private:
   PetscErrorCode create_solver();
@@ -111,6 +115,8 @@ private:
   PetscErrorCode offer_fixed_stress(KSP ksp);
   /// Whether two times of this run are the same up to rounding.
   bool same(PetscReal t, PetscReal other) const;
+  /// The last accepted state is at a kink in time: nothing may look back beyond it.
+  void begin_smooth_stretch();
   /// Step size from time @p t, shortened to land on the end of the ramp or of the phase.
   PetscReal landing(PetscReal t) const;
   PetscErrorCode make_rate();
@@ -129,6 +135,8 @@ private:
   Model &model_;
   Airway airway_;
   TimeScheme scheme_;
+  StepControl step_control_;
+  StepControl::Value candidate_; ///< at the end of the step that is to be accepted
   Predictor predictor_;
   Lagging lagging_;
   std::vector<Observer *> observers_;

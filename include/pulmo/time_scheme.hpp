@@ -21,6 +21,7 @@ public:
   /// Reads the type off @p ts and refuses those whose rate is not conservative here. @p like: a local vector.
   PetscErrorCode setup(TS ts, Vec like);
   bool multistep() const { return multistep_; }
+  int order() const { return multistep_ ? 2 : 1; }
 
   /// Begins with the state @p local of volume @p volume (mm^3 above rest) at time @p t.
   PetscErrorCode begin(Model &model, PetscReal t, PetscReal volume, Vec local);
