@@ -21,7 +21,7 @@ public:
 
   /// @p held: name of the constraint whose force is kept (empty: none).
   History(Model &model, std::vector<Quantity> quantities, std::string held = "")
-      : model_(model), quantities_(std::move(quantities)), held_(std::move(held)), means(quantities_.size())
+      : means(quantities.size()), model_(model), quantities_(std::move(quantities)), held_(std::move(held))
   {}
 
   PetscErrorCode observe(const StepReport &step) override
@@ -43,6 +43,11 @@ public:
     if (!held_.empty()) PetscCall(keep_force(step));
     PetscFunctionReturn(PETSC_SUCCESS);
   }
+
+  std::vector<double> times;                   ///< s
+  std::vector<double> volume;                  ///< int (J - 1), mm^3
+  std::vector<std::vector<double>> means;      ///< of each quantity
+  std::vector<std::array<PetscReal, 3>> force; ///< on the body, kPa mm^2
 
 private:
   Model &model_;
@@ -69,12 +74,6 @@ private:
     PetscCall(VecCopy(step.local, before_));
     PetscFunctionReturn(PETSC_SUCCESS);
   }
-
-public:
-  std::vector<double> times;                   ///< s
-  std::vector<double> volume;                  ///< int (J - 1), mm^3
-  std::vector<std::vector<double>> means;      ///< of each quantity
-  std::vector<std::array<PetscReal, 3>> force; ///< on the body, kPa mm^2
 };
 
 } // namespace pulmo::test
