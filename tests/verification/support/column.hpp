@@ -35,6 +35,26 @@ inline double J_of_stress(double stress)
   return J;
 }
 
+/// k(J) = c J / W''(J): makes dJ/dt = c d2J/dX2.
+struct DiffusivePermeability {
+  static constexpr const char *name = "diffusive";
+  struct Parameters {
+    static constexpr const char *owner = "permeability";
+    PetscScalar diffusivity = 1; ///< c, mm^2/s
+  };
+  static PetscErrorCode declare(Options &options, Parameters &p)
+  {
+    PetscFunctionBeginUser;
+    PetscCall(options.real("diffusivity", "mm^2/s", Range::positive(), "c of k = c J / W''(J)", p.diffusivity));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+  static PermeabilityValue permeability(PetscScalar J, const Parameters &p)
+  {
+    const double w = W2(J);
+    return {p.diffusivity * J / w, p.diffusivity * (1 / w - J * W3(J) / (w * w))};
+  }
+};
+
 /// What is left of a unit step after time @p t of s_t = diffusivity s_XX, s(X, 0) = 1, s_X(0) = 0, s(1) = 0:
 ///   s = (4/pi) sum (-1)^m/(2m+1) cos((2m+1) pi X/2) d_m.
 /// @p steps = 0: d_m = exp(-lambda_m t), the exact solution. Otherwise d_m = (1 + lambda_m t/steps)^-steps, the exact

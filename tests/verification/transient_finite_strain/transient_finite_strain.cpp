@@ -13,26 +13,6 @@ using namespace pulmo::test;
 
 namespace {
 
-/// k(J) = c J / W''(J): makes dJ/dt = c d2J/dX2.
-struct DiffusivePermeability {
-  static constexpr const char *name = "diffusive";
-  struct Parameters {
-    static constexpr const char *owner = "permeability";
-    PetscScalar diffusivity = 1; ///< c, mm^2/s
-  };
-  static PetscErrorCode declare(Options &options, Parameters &p)
-  {
-    PetscFunctionBeginUser;
-    PetscCall(options.real("diffusivity", "mm^2/s", Range::positive(), "c of k = c J / W''(J)", p.diffusivity));
-    PetscFunctionReturn(PETSC_SUCCESS);
-  }
-  static PermeabilityValue permeability(PetscScalar J, const Parameters &p)
-  {
-    const double w = column::W2(J);
-    return {p.diffusivity * J / w, p.diffusivity * (1 / w - J * column::W3(J) / (w * w))};
-  }
-};
-
 struct Result {
   double J0, p0, V;
 };
@@ -42,7 +22,7 @@ constexpr double T = -1, t_end = 0.1;
 void run_column(int steps, Result &result)
 {
   Registry registry = Registry::standard();
-  registry.permeability_law<DiffusivePermeability>();
+  registry.permeability_law<column::DiffusivePermeability>();
   pulmo::Run run(registry);
   bool finished = false;
   PULMO_OK(prepare(run, column::options("-airflow_permeability_law diffusive -airflow_diffusivity 1 -traction "
