@@ -22,6 +22,21 @@ void Airway::begin_phase(const Phase &phase, PetscReal volume)
   limited_ = limited_before_ = retake_ = false;
 }
 
+PetscErrorCode Airway::persist(Archive &archive)
+{
+  PetscReal from = phase_.from.value_or(0);
+
+  PetscFunctionBeginUser;
+  PetscCall(archive.value("airway/phase_starts_from", from)); // kPa or mm^3/s
+  phase_.from = from;
+  PetscCall(archive.value("airway/limited", limited_before_));
+  PetscCall(archive.value("airway/pressure_kPa", pressure_before_));
+  PetscCall(archive.value("airway/ventilator_pressure_kPa", ventilator_before_));
+  PetscCall(archive.value("airway/volume_at_phase_begin_mm3", volume_begin_));
+  PetscCall(archive.value("airway/volume_mm3", volume_before_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 void Airway::set_mode()
 {
   // the mean over a free surface is no pressure that can be held instead: a limit needs a common one

@@ -82,6 +82,21 @@ PetscErrorCode EnergyAudit::setup()
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode EnergyAudit::persist(Archive &archive, Vec local)
+{
+  EnergyBalance empty;
+
+  PetscFunctionBeginUser;
+  empty.accounts.assign(accounts_.size(), 0);
+  PetscCall(archive.table("energy", rows_, empty, [](EnergyBalance &row, Cells &cells) {
+    cells(row.ventilator_work, row.exchanged, row.residual);
+    for (double &sum : row.accounts) cells(sum);
+  }));
+  PetscCall(archive.value("energy/gas_pressure_kPa", gas_pressure_));
+  if (archive.reading()) PetscCall(VecCopy(local, before_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode EnergyAudit::integrate(const Part &part, const StepReport &step, std::vector<double> &sums)
 {
   PetscDS ds;

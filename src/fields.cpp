@@ -1,10 +1,12 @@
 // Field snapshots: HDF5 through PETSc's viewer, one XDMF index with quadratic tetrahedra.
+#include "pulmo/node_order.hpp"
 #include "pulmo/output.hpp"
 
 #include <array>
 #include <cmath>
 #include <filesystem>
 #include <fstream>
+#include <sstream>
 
 namespace pulmo {
 
@@ -56,10 +58,11 @@ PetscErrorCode close_whole(MPI_Comm comm, const std::string &file, ViewerHandle 
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-std::string snapshot_name(std::size_t index)
+/// The file of the snapshot @p index, or of what else belongs to it.
+std::string snapshot_name(PetscInt index, const char *what = "")
 {
-  char name[32];
-  std::snprintf(name, sizeof(name), "fields_%05zu.h5", index);
+  char name[64];
+  std::snprintf(name, sizeof(name), "fields_%05d%s.h5", static_cast<int>(index), what);
   return name;
 }
 
@@ -67,17 +70,73 @@ std::string snapshot_name(std::size_t index)
 
 PetscErrorCode FieldWriter::observe(const StepReport &step)
 {
-  const PetscReal every = output_.fields_every();
   const bool start = step.row.dt == 0;
 
   PetscFunctionBeginUser;
-  if (every > 0) {
-    if (step.row.time < next_ - 1e-9 * every) PetscFunctionReturn(PETSC_SUCCESS);
-    next_ = (std::floor(step.row.time / every + 1e-9) + 1) * every;
-  } else if (!start && !step.phase_ends) {
-    PetscFunctionReturn(PETSC_SUCCESS);
+  if (output_.fields_every() > 0 ? schedule_.due(step.row.time) : start || step.phase_ends)
+    PetscCall(snapshot(step.row.time, step.local));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode FieldWriter::persist(Archive &archive, Vec)
+{
+  std::string names;
+
+  PetscFunctionBeginUser;
+  for (const Snapshot &s : snapshots_) names += s.file + " " + s.mesh + "\n";
+  PetscCall(archive.text("fields/files", names));
+  PetscCall(archive.table("fields/times_s", snapshots_, Snapshot(), [](Snapshot &s, Cells &cells) { cells(s.time); }));
+  PetscCall(archive.value("fields/count", count_));
+  if (archive.reading()) {
+    std::istringstream lines(names);
+    for (Snapshot &s : snapshots_) {
+      lines >> s.file >> s.mesh;
+      const bool plain = s.file.rfind("fields", 0) == 0 && s.mesh.rfind("fields", 0) == 0 &&
+                         (s.file + s.mesh).find('/') == std::string::npos;
+      PetscCall(archive.check(plain, "fields/files"));
+    }
   }
-  PetscCall(snapshot(step.row.time, step.local));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+std::vector<std::string> FieldWriter::files() const
+{
+  std::vector<std::string> list;
+  for (const Snapshot &s : snapshots_) list.insert(list.end(), {s.file, s.mesh});
+  return list;
+}
+
+PetscErrorCode FieldWriter::carry_over(const std::string &from)
+{
+  namespace fs = std::filesystem;
+  const MPI_Comm comm = PetscObjectComm((PetscObject)model_.dm());
+  PetscMPIInt rank;
+  std::vector<char> there(snapshots_.size(), 1);
+  std::size_t k = 0;
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  for (std::size_t i = 0; rank == 0 && i < snapshots_.size(); ++i)
+    for (const std::string &name : {snapshots_[i].file, snapshots_[i].mesh}) {
+      const fs::path old = fs::path(from) / name, here = output_.path(name);
+      std::error_code error;
+      if (fs::exists(here, error)) continue;
+      fs::create_hard_link(old, here, error); // a snapshot is never changed, only replaced
+      if (error) fs::copy_file(old, here, error);
+      if (error) there[i] = 0;
+    }
+  PetscCallMPI(MPI_Bcast(there.data(), static_cast<PetscMPIInt>(there.size()), MPI_CHAR, 0, comm));
+  for (std::size_t i = 0; i < there.size(); ++i)
+    if (there[i]) snapshots_[k++] = snapshots_[i];
+  if (k < snapshots_.size())
+    PetscCall(PetscPrintf(comm, "pulmo: warning: %d of %d earlier snapshots are not in %s: fields.xdmf lacks them\n",
+                          static_cast<int>(snapshots_.size() - k), static_cast<int>(snapshots_.size()), from.c_str()));
+  if (!snapshots_.empty()) schedule_.skip(snapshots_.back().time);
+  snapshots_.resize(k);
+  if (k == 0) PetscFunctionReturn(PETSC_SUCCESS);
+  mesh_ = snapshot_name(count_, "_mesh"); // other ranks number nodes otherwise
+  PetscCall(number_nodes());
+  PetscCall(write_index());
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -86,22 +145,14 @@ PetscErrorCode FieldWriter::number_nodes()
 {
   const DM dm = model_.dm();
   const MPI_Comm comm = PetscObjectComm((PetscObject)dm);
-  PetscInt begin, end, first = 0, roots, n_leaves;
-  const PetscInt *leaves;
+  PetscInt begin, end, first = 0, roots;
   PetscSF sf;
 
   PetscFunctionBeginUser;
   PetscCall(DMPlexGetChart(dm, &begin, &end));
+  PetscCall(owned_nodes(dm, nodes_));
   PetscCall(DMGetPointSF(dm, &sf));
-  PetscCall(PetscSFGetGraph(sf, &roots, &n_leaves, &leaves, nullptr));
-  std::vector<char> foreign(static_cast<std::size_t>(end), 0);
-  for (PetscInt i = 0; roots >= 0 && i < n_leaves; ++i) foreign[leaves ? leaves[i] : i] = 1;
-  for (PetscInt depth = 0; depth < 2; ++depth) {
-    PetscInt a, b;
-    PetscCall(DMPlexGetDepthStratum(dm, depth, &a, &b));
-    for (PetscInt p = a; p < b; ++p)
-      if (!foreign[p]) nodes_.push_back(p);
-  }
+  PetscCall(PetscSFGetGraph(sf, &roots, nullptr, nullptr, nullptr));
   const auto mine = static_cast<PetscInt>(nodes_.size());
   PetscCallMPI(MPI_Exscan(&mine, &first, 1, MPIU_INT, MPI_SUM, comm));
   PetscMPIInt rank;
@@ -130,7 +181,7 @@ PetscErrorCode FieldWriter::write_mesh()
   ISHandle cells;
 
   PetscFunctionBeginUser;
-  PetscCall(number_nodes());
+  if (n_nodes_ < 0) PetscCall(number_nodes());
   PetscCall(DMPlexGetDepthStratum(dm, 0, &vertex_begin, &vertex_end));
   PetscCall(DMPlexGetDepthStratum(dm, 1, &edge_begin, &edge_end));
   PetscCall(DMPlexGetHeightStratum(dm, 0, &cell_begin, &cell_end));
@@ -157,7 +208,7 @@ PetscErrorCode FieldWriter::write_mesh()
       PetscCall(DMPlexRestoreJoin(dm, 2, ends, &n_join, &join));
     }
   }
-  const std::string file = output_.path("fields.h5");
+  const std::string file = output_.path(mesh_);
   PetscCall(open_part(comm, file, viewer));
   PetscCall(write_values(viewer, "geometry", 3, geometry));
   PetscCall(ISCreateGeneral(comm, (PetscInt)topology.size(), topology.data(), PETSC_COPY_VALUES, cells.out()));
@@ -165,6 +216,7 @@ PetscErrorCode FieldWriter::write_mesh()
   PetscCall(PetscObjectSetName((PetscObject)(IS)cells, "topology"));
   PetscCall(ISView(cells, viewer));
   PetscCall(close_whole(comm, file, viewer));
+  mesh_written_ = true;
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -181,8 +233,8 @@ PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
   ViewerHandle viewer;
 
   PetscFunctionBeginUser;
-  if (!times_.empty() && times_.back() == time) PetscFunctionReturn(PETSC_SUCCESS);
-  if (n_nodes_ < 0) PetscCall(write_mesh());
+  if (!snapshots_.empty() && snapshots_.back().time == time) PetscFunctionReturn(PETSC_SUCCESS);
+  if (!mesh_written_) PetscCall(write_mesh());
   const ReadArray x(local);
   PetscCall(DMGetLocalSection(dm, &section));
   PetscCall(DMPlexGetDepthStratum(dm, 0, &vertex_begin, &vertex_end));
@@ -230,7 +282,7 @@ PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
     von_mises.push_back(mean_m);
     if (gas) porosity.push_back(1 - (1 - scene_.airflow().porosity()) / mean_J);
   }
-  const std::string file = output_.path(snapshot_name(times_.size()));
+  const std::string name = snapshot_name(count_), file = output_.path(name);
   PetscCall(open_part(comm, file, viewer));
   PetscCall(write_values(viewer, "displacement", 3, u));
   PetscCall(write_values(viewer, "J", 1, J));
@@ -241,7 +293,8 @@ PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
     PetscCall(write_values(viewer, "porosity", 1, porosity));
   }
   PetscCall(close_whole(comm, file, viewer));
-  times_.push_back(time);
+  ++count_;
+  snapshots_.push_back({time, name, mesh_});
   PetscCall(write_index());
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -266,19 +319,18 @@ PetscErrorCode FieldWriter::write_index() const
     f << "<?xml version=\"1.0\"?>\n<Xdmf Version=\"3.0\">\n<Domain>\n"
       << "<Grid Name=\"lung\" GridType=\"Collection\" CollectionType=\"Temporal\">\n";
     f.precision(15);
-    for (std::size_t k = 0; k < times_.size(); ++k) {
-      const std::string h5 = snapshot_name(k);
+    for (const Snapshot &s : snapshots_) {
       const auto attribute = [&](const char *name, const char *centre, PetscInt rows, PetscInt columns) {
         f << "  <Attribute Name=\"" << name << "\" AttributeType=\"" << (columns == 3 ? "Vector" : "Scalar")
           << "\" Center=\"" << centre << "\">";
-        item(h5.c_str(), name, rows, columns, "Float");
+        item(s.file.c_str(), name, rows, columns, "Float");
         f << "</Attribute>\n";
       };
-      f << " <Grid Name=\"step\" GridType=\"Uniform\">\n  <Time Value=\"" << times_[k]
+      f << " <Grid Name=\"step\" GridType=\"Uniform\">\n  <Time Value=\"" << s.time
         << "\"/>\n  <Topology TopologyType=\"Tetrahedron_10\" NumberOfElements=\"" << n_cells_ << "\">";
-      item("fields.h5", "topology", n_cells_, 10, "Int");
+      item(s.mesh.c_str(), "topology", n_cells_, 10, "Int");
       f << "</Topology>\n  <Geometry GeometryType=\"XYZ\">";
-      item("fields.h5", "geometry", n_nodes_, 3, "Float");
+      item(s.mesh.c_str(), "geometry", n_nodes_, 3, "Float");
       f << "</Geometry>\n";
       attribute("displacement", "Node", n_nodes_, 3);
       attribute("J", "Cell", n_cells_, 1);

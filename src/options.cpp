@@ -292,14 +292,32 @@ PetscErrorCode Options::all_given(std::vector<std::pair<std::string, std::string
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+std::vector<std::pair<std::string, std::string>> Options::own_used() const
+{
+  std::vector<std::pair<std::string, std::string>> list;
+  for (const Declared &d : declared_)
+    if (groups_[d.group].in_use) list.emplace_back(d.name, d.used);
+  return list;
+}
+
+bool Options::same_value(const std::string &a, const std::string &b)
+{
+  if (a == b || (truth(a) && truth(a) == truth(b))) return true;
+  const std::vector<std::string> parts_a = split(a, ','), parts_b = split(b, ',');
+  return std::equal(parts_a.begin(), parts_a.end(), parts_b.begin(), parts_b.end(),
+                    [](const std::string &x, const std::string &y) {
+                      char *end_x = nullptr, *end_y = nullptr;
+                      const double number_x = std::strtod(x.c_str(), &end_x), number_y = std::strtod(y.c_str(), &end_y);
+                      return x == y || (*end_x == '\0' && *end_y == '\0' && number_x == number_y);
+                    });
+}
+
 PetscErrorCode Options::all_used(std::vector<std::pair<std::string, std::string>> &list) const
 {
   std::vector<std::pair<std::string, std::string>> given;
 
   PetscFunctionBeginUser;
-  list.clear();
-  for (const Declared &d : declared_)
-    if (groups_[d.group].in_use) list.emplace_back(d.name, d.used);
+  list = own_used();
   PetscCall(all_given(given));
   for (const auto &[name, value] : given) {
     const std::string &option = name;

@@ -2,6 +2,8 @@
 
 #include "pulmo/units.hpp"
 
+#include <algorithm>
+#include <cmath>
 #include <filesystem>
 #include <system_error>
 
@@ -38,18 +40,23 @@ PetscErrorCode Output::declare(Options &options)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Output::prepare(const Options &options)
+PetscErrorCode Output::prepare(const Options &options, const std::string &restart, const std::vector<std::string> &kept)
 {
   const MPI_Comm comm = options.comm();
   PetscMPIInt rank;
-  bool free = true, writable = true;
+  bool free = true, unfinished = false, writable = true, continues = false;
+  std::string left; // a checkpoint of an earlier run
 
   PetscFunctionBeginUser;
   PetscCallMPI(MPI_Comm_rank(comm, &rank));
   if (rank == 0) {
     std::error_code error;
+    continues = !restart.empty() && fs::equivalent(fs::absolute(restart).parent_path(), directory_, error) && !error;
     free = overwrite_ || !fs::exists(path("summary.json"), error);
-    if (free) {
+    for (const char *name : {"checkpoint_previous.h5", "checkpoint.h5"})
+      if (fs::exists(path(name), error)) left = path(name);
+    unfinished = !overwrite_ && !continues && !left.empty();
+    if (free && !unfinished) {
       fs::create_directories(directory_, error);
       const std::string probe = path(".pulmo_probe");
       std::FILE *f = std::fopen(probe.c_str(), "w");
@@ -59,23 +66,45 @@ PetscErrorCode Output::prepare(const Options &options)
     }
   }
   PetscCall(on_all_ranks(comm, free));
+  PetscCall(on_all_ranks(comm, unfinished));
   PetscCall(on_all_ranks(comm, writable));
   PulmoUserCheck(free, comm, "-output_dir %s holds a finished run; give another directory or -output_overwrite",
                  directory_.c_str());
+  PulmoUserCheck(!unfinished, comm,
+                 "-output_dir %s holds the checkpoint of an unfinished run: go on with -restart %s, or give another "
+                 "directory or -output_overwrite",
+                 directory_.c_str(), left.c_str());
   PulmoUserCheck(writable, comm, "-output_dir %s cannot be written; choose another directory or free the disk",
                  directory_.c_str());
   if (rank == 0) { // what an earlier run left must not pass for this one's
     std::error_code error;
-    for (const char *old :
-         {"summary.json", "failure.json", "signals.csv", "signals.csv.part", "energy.csv", "fields.xdmf", "fields.h5"})
-      fs::remove(path(old), error);
+    std::vector<fs::path> old;
+    for (const char *name : {"summary.json", "failure.json", "signals.csv", "energy.csv", "fields.xdmf"})
+      old.push_back(path(name));
+    if (!continues) // else they are replaced whole
+      for (const char *name : {"signals.csv.part", "checkpoint.h5", "checkpoint_previous.h5", "checkpoint.h5.part"})
+        old.push_back(path(name));
     for (const auto &entry : fs::directory_iterator(directory_, error)) {
       const std::string name = entry.path().filename().string();
-      if (name.rfind("fields_", 0) == 0 && entry.path().extension() == ".h5") fs::remove(entry.path(), error);
+      const bool keep = continues && std::find(kept.begin(), kept.end(), name) != kept.end();
+      if (name.rfind("fields", 0) == 0 && entry.path().extension() == ".h5" && !keep) old.push_back(entry.path());
     }
+    for (const fs::path &file : old) fs::remove(file, error);
   }
   PetscCallMPI(MPI_Barrier(comm));
   PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+bool Schedule::due(PetscReal t)
+{
+  if (every_ <= 0 || t < next_ - 1e-9 * every_) return false;
+  skip(t);
+  return true;
+}
+
+void Schedule::skip(PetscReal t)
+{
+  if (every_ > 0) next_ = (std::floor(t / every_ + 1e-9) + 1) * every_;
 }
 
 SignalWriter::~SignalWriter()
@@ -92,15 +121,17 @@ PetscErrorCode SignalWriter::observe(const StepReport &step)
   PetscCallMPI(MPI_Comm_rank(comm_, &rank));
   if (rank == 0) {
     const bool ventilator = facts_.ventilator != nullptr, flow = ventilator || facts_.airflow;
+    std::size_t first = step.rows.size() - 1;
     if (!file_) {
+      first = 0; // a restarted run has earlier rows
       file_ = std::fopen(output_.path("signals.csv.part").c_str(), "w");
       if (file_)
         std::fprintf(file_, "time_s,%s%svolume_ml,%sdt_s,newton_iterations,krylov_iterations,min_J,max_J%s\n",
                      ventilator ? "airway_pressure_cmH2O," : "", flow ? "flow_ml_per_s," : "",
                      ventilator ? "phase," : "", facts_.tube ? ",ventilator_pressure_cmH2O" : "");
     }
-    if (file_) {
-      const SignalRow &r = step.row;
+    for (std::size_t i = first; file_ && i < step.rows.size(); ++i) {
+      const SignalRow &r = step.rows[i];
       std::fprintf(file_, "%.15g,", r.time);
       if (ventilator) std::fprintf(file_, "%.15g,", r.pressure);
       if (flow) std::fprintf(file_, "%.15g,", r.flow);
@@ -145,13 +176,14 @@ PetscErrorCode ProgressPrinter::observe(const StepReport &step)
 
   PetscFunctionBeginUser;
   PetscCall(PetscTime(&now));
-  if (r.dt == 0) {
+  if (from_ < 0) {
     start_ = now;
+    from_ = r.time;
     PetscCall(PetscPrintf(comm_, "%9s %10s %6s %6s %10s %10s %8s %8s  %s\n", "time s", "dt s", "Newton", "Krylov",
                           "P cmH2O", "V ml", "min J", "ETA s", facts_.ventilator ? "phase" : ""));
-    PetscFunctionReturn(PETSC_SUCCESS);
+    if (r.dt == 0) PetscFunctionReturn(PETSC_SUCCESS);
   }
-  const double left = r.time > 0 ? (now - start_) * (step.end - r.time) / r.time : 0;
+  const double left = r.time > from_ ? (now - start_) * (step.end - r.time) / (r.time - from_) : 0;
   PetscCall(PetscPrintf(comm_, "%9.4f %10.3g %6ld %6ld %10.3f %10.3f %8.4f %8.0f  %s\n", r.time, r.dt, r.newton,
                         r.krylov, r.pressure, r.volume, r.min_J, left, facts_.ventilator ? r.phase.c_str() : ""));
   PetscFunctionReturn(PETSC_SUCCESS);

@@ -51,6 +51,20 @@ PetscErrorCode Predictor::begin(Vec X)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode Predictor::persist(Archive &archive, Vec X)
+{
+  PetscInt known = known_;
+
+  PetscFunctionBeginUser;
+  PetscCall(archive.value("predictor/increments", known));
+  if (archive.reading()) {
+    PetscCall(begin(X));
+    known_ = std::min(known, increments_);
+  }
+  for (PetscInt i = 0; i < known_; ++i) PetscCall(archive.global("increment_" + std::to_string(i + 1), increment_[i]));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode Predictor::accept(Vec X)
 {
   PetscFunctionBeginUser;

@@ -1,6 +1,6 @@
 #include "pulmo/pulmo.hpp"
 
-#include "pulmo/output.hpp"
+#include "pulmo/checkpoint.hpp"
 
 namespace pulmo {
 
@@ -57,6 +57,34 @@ PetscReal reference_modulus(const TissueLaw &law)
   return largest > 0 ? largest : 1;
 }
 
+/// Ends a run that a signal asked to stop: a checkpoint, and how to go on.
+PetscErrorCode stop(Checkpoint &checkpoint, const Simulation &simulation, const char *signal)
+{
+  const MPI_Comm comm = PETSC_COMM_WORLD;
+  std::string complaint;
+
+  PetscFunctionBeginUser;
+  PulmoUserCheck(simulation.rows().size() > 1, comm, "stopped by %s before the first step; nothing is lost", signal);
+  PetscCall(checkpoint.write(complaint));
+  PulmoUserCheck(complaint.empty(), comm, "stopped by %s after t = %.6g s, and %s", signal, (double)simulation.time(),
+                 complaint.c_str());
+  PulmoUserError(comm, "stopped by %s after t = %.6g s; to go on, give the same options and -restart %s", signal,
+                 (double)simulation.time(), checkpoint.path().c_str());
+}
+
+/// A checkpoint of the last state of a run that failed. @p text: where it is, or why there is none.
+PetscErrorCode keep_last_state(Checkpoint &checkpoint, const Simulation &simulation, std::string &text)
+{
+  std::string complaint;
+
+  PetscFunctionBeginUser;
+  if (simulation.rows().size() < 2) PetscFunctionReturn(PETSC_SUCCESS); // the start is no loss
+  PetscCall(checkpoint.write(complaint));
+  text = complaint.empty() ? " With another solver go on from there: -restart " + checkpoint.path() + "."
+                           : " No checkpoint: " + complaint + ".";
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 } // namespace
 
 PetscErrorCode initialize()
@@ -107,6 +135,7 @@ PetscErrorCode run(const Registry &registry, bool &finished)
   const Scene &scene = run.scene();
   Simulation &simulation = run.simulation();
   Output output;
+  Checkpoint checkpoint(options, output, scene, run.model(), simulation);
   bool view_effects = false, audit_energy = true;
   PetscBool help, has_mesh;
 
@@ -114,6 +143,7 @@ PetscErrorCode run(const Registry &registry, bool &finished)
   finished = false;
   PetscCall(run.declare());
   PetscCall(output.declare(options));
+  PetscCall(checkpoint.declare(options));
   options.group("effects", "ledger");
   PetscCall(options.flag("view", "print effects, fields, terms, blocks and seconds at the end", view_effects));
   options.group("energy", "energy balance");
@@ -130,7 +160,6 @@ PetscErrorCode run(const Registry &registry, bool &finished)
       run.model().composition().held(), comm,
       "nothing holds the lung in place: give -chest_wall (springs), or -support -support_rigid to let it move "
       "freely but for the six rigid-body motions");
-  PetscCall(output.prepare(options));
 
   SignalWriter signals(comm, output, scene.facts());
   ProgressPrinter progress(comm, scene.facts());
@@ -149,15 +178,27 @@ PetscErrorCode run(const Registry &registry, bool &finished)
   simulation.add(signals);
   simulation.add(fields);
   if (output.progress()) simulation.add(progress);
-  PetscCall(simulation.run(finished));
+  simulation.add(checkpoint);
+  const bool restarts = !checkpoint.restart().empty();
+  if (restarts) PetscCall(checkpoint.restore());
+  PetscCall(output.prepare(options, checkpoint.restart(), fields.files()));
+  if (restarts) PetscCall(fields.carry_over(checkpoint.restart_directory()));
+  {
+    StopSignal signal(comm);
+    simulation.heed(signal);
+    PetscCall(simulation.run(finished));
+    if (simulation.stopped()) PetscCall(stop(checkpoint, simulation, signal.name()));
+  }
   PetscCall(options.warn_unused());
   if (view_effects) PetscCall(print_ledger(comm, scene, run.model(), simulation.seconds()));
   if (audit_energy) PetscCall(write_energy(comm, output, simulation, energy));
   if (!finished) {
+    std::string kept;
+    PetscCall(keep_last_state(checkpoint, simulation, kept));
     PetscCall(fields.snapshot(simulation.time(), simulation.local_state()));
     PetscCall(write_summary(options, output, scene, run.model(), simulation, audits, false));
-    PulmoUserError(comm, "%s The last good state and the signals so far are in %s.", simulation.failure_text().c_str(),
-                   output.directory().c_str());
+    PulmoUserError(comm, "%s The last good state and the signals so far are in %s.%s",
+                   simulation.failure_text().c_str(), output.directory().c_str(), kept.c_str());
   }
   PetscCall(signals.finish());
   PetscCall(write_summary(options, output, scene, run.model(), simulation, audits, true));

@@ -79,6 +79,17 @@ PetscErrorCode RegionAudit::observe(const StepReport &step)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode RegionAudit::persist(Archive &archive, Vec)
+{
+  const std::vector<RegionState> empty(volumes_.size());
+
+  PetscFunctionBeginUser;
+  PetscCall(archive.table("regions", rows_, empty, [](std::vector<RegionState> &row, Cells &cells) {
+    for (RegionState &s : row) cells(s.volume_change, s.mean_J, s.sd_J, s.mean_pressure, s.sd_pressure);
+  }));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 std::vector<SignalRow> RegionAudit::complete(std::vector<SignalRow> rows) const
 {
   if (scene_.facts().airflow)

@@ -348,14 +348,11 @@ PetscReal Simulation::next_step(PetscReal t, PetscReal h, PetscReal growth)
   return landing(t);
 }
 
-PetscErrorCode Simulation::run(bool &finished)
+PetscErrorCode Simulation::start()
 {
-  const MPI_Comm comm = options_.comm();
   Measures measures;
-  PetscLogDouble start, end;
 
   PetscFunctionBeginUser;
-  PetscCall(PetscTime(&start));
   PetscCall(VecZeroEntries(state_));
   PetscCall(predictor_.begin(state_));
   PetscCall(DMGlobalToLocal(model_.dm(), state_, INSERT_VALUES, before_));
@@ -367,26 +364,43 @@ PetscErrorCode Simulation::run(bool &finished)
     accepted_.pressure = phases_.front().from.value_or(0) / units::kPa_per_cmH2O;
   accepted_.ventilator_pressure = accepted_.pressure;
   PetscCall(report(accepted_, measures));
-
-  finished = true;
   dt_ = wanted_dt_;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Simulation::run(bool &finished)
+{
+  const MPI_Comm comm = options_.comm();
+  PetscLogDouble begin, end;
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscTime(&begin));
+  if (!resumed_) PetscCall(start());
+  finished = true;
   for (const Phase &phase : phases_) {
     TSConvergedReason reason;
+    const bool within = resumed_ && &phase == phase_;
+    if (resumed_ && &phase < phase_) continue;
+    resumed_ = false;
+    if (within && same(accepted_.time, phase.end)) continue;
     phase_ = &phase;
-    airway_.begin_phase(phase, accepted_.volume * units::mm3_per_ml);
-    PetscCall(TSSetTime(ts_, phase.begin));
+    if (!within) {
+      airway_.begin_phase(phase, accepted_.volume * units::mm3_per_ml);
+      next_dt_ = landing(phase.begin);
+    }
+    PetscCall(TSSetTime(ts_, within ? accepted_.time : phase.begin));
     PetscCall(TSSetMaxTime(ts_, phase.end));
-    PetscCall(TSSetTimeStep(ts_, landing(phase.begin)));
+    PetscCall(TSSetTimeStep(ts_, next_dt_));
     PetscCall(TSSolve(ts_, state_));
     PetscCall(TSGetConvergedReason(ts_, &reason));
-    if (reason < 0) {
+    if (reason < 0 || stopped_) {
       finished = false;
       break;
     }
   }
   PetscCall(PetscTime(&end));
-  seconds_.total = end - start + seconds_.setup;
-  seconds_.solve = end - start - seconds_.residual - seconds_.jacobian - seconds_.output;
+  seconds_.total = end - begin + seconds_.setup;
+  seconds_.solve = end - begin - seconds_.residual - seconds_.jacobian - seconds_.output;
   PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &seconds_, 6, MPI_DOUBLE, MPI_MAX, comm));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -615,6 +629,8 @@ PetscErrorCode Simulation::reject(PetscReal dt, const std::string &reason, Petsc
   const PetscReal next = dt * adapt->scale_solve_failed;
   if (next < std::max(adapt->dt_min, least_step * wanted_dt_))
     PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
+  PetscCall(heed_signal());
+  if (stopped_) PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -632,6 +648,7 @@ PetscErrorCode Simulation::after_step()
   PetscCall(TSGetSNES(ts_, &snes));
   PetscCall(lagging_.settle(snes));
   PetscCall(TSGetTime(ts_, &t));
+  PetscCall(TSGetTimeStep(ts_, &next_dt_));
   row.dt = t - accepted_.time;
   cut_ = false;
   const bool landed = same(t, phase_->end) || same(t, phase_->begin + phase_->ramp);
@@ -683,6 +700,15 @@ PetscErrorCode Simulation::after_step()
   accepted_ = row;
   PetscCall(report(row, measures));
   if (crawled_ == crawling_steps) PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
+  if (!same(t, end_)) PetscCall(heed_signal());
+  if (stopped_) PetscCall(TSSetConvergedReason(ts_, TS_CONVERGED_USER));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Simulation::heed_signal()
+{
+  PetscFunctionBeginUser;
+  if (stop_signal_) PetscCall(stop_signal_->asked(stopped_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -696,7 +722,7 @@ PetscErrorCode Simulation::report(const SignalRow &row, const Measures &measures
   worst_balance_ = std::max(worst_balance_, std::abs(balance));
   min_J_ = std::min(min_J_, measures.min_J);
   const bool phase_ends = phase_ && same(row.time, phase_->end);
-  const StepReport step{row, measures, balance, before_, end_, phase_ends};
+  const StepReport step{rows_, row, measures, balance, before_, end_, phase_ends};
   for (Observer *observer : observers_) PetscCall(observer->observe(step));
   PetscFunctionReturn(PETSC_SUCCESS);
 }

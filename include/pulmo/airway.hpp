@@ -3,6 +3,7 @@
 /// that is an unknown of its own.
 #pragma once
 
+#include "pulmo/archive.hpp"
 #include "pulmo/model.hpp"
 
 namespace pulmo {
@@ -25,6 +26,13 @@ public:
   /// Begins a phase at lung volume @p volume (mm^3 above rest). A ramp of pressure without a start value starts from
   /// what the ventilator has then.
   void begin_phase(const Phase &phase, PetscReal volume);
+  /// Writes or reads what a step needs of the phase and of the steps before it; the phase was begun.
+  PetscErrorCode persist(Archive &archive);
+  /// After persist() has read: puts a gas pressure that has no node into a global vector.
+  PetscErrorCode restore(Vec X) const
+  {
+    return model_.composition().common_gas_pressure() ? model_.set_carrier_value(X, pressure_before_) : PETSC_SUCCESS;
+  }
   /// Begins an attempt at a step of size @p dt that ends at @p t, s.
   void begin_step(PetscReal t, PetscReal dt);
   /// The attempt at hand failed and is made once more, as it was.

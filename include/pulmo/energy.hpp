@@ -42,6 +42,7 @@ public:
   /// After the model was built and the sampling set up.
   PetscErrorCode setup();
   PetscErrorCode observe(const StepReport &step) override;
+  PetscErrorCode persist(Archive &archive, Vec local) override;
 
   const std::vector<EnergyAccount> &accounts() const { return accounts_; }
   /// Since the start of the run, one entry per row of the signals.

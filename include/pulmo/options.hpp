@@ -69,6 +69,10 @@ public:
   /// Name and value of every option that the run used: pulmo's own of what is in use, defaults included, and PETSc's
   /// as given.
   PetscErrorCode all_used(std::vector<std::pair<std::string, std::string>> &list) const;
+  /// The first half of it: pulmo's own.
+  std::vector<std::pair<std::string, std::string>> own_used() const;
+  /// Whether two values of an option say the same: 1e4 and 10000, on and true.
+  static bool same_value(const std::string &a, const std::string &b);
 
 private:
   struct Declared {

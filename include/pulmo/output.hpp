@@ -14,8 +14,10 @@ namespace pulmo {
 class Output {
 public:
   PetscErrorCode declare(Options &options);
-  /// Makes the directory; refuses one that holds a finished run unless `-output_overwrite`.
-  PetscErrorCode prepare(const Options &options);
+  /// Makes the directory; refuses one that holds a finished run, or a checkpoint, unless `-output_overwrite`.
+  /// @p restart: the checkpoint that the run goes on from, if any; what lies beside it stays as far as it is named in
+  /// @p kept.
+  PetscErrorCode prepare(const Options &options, const std::string &restart, const std::vector<std::string> &kept);
 
   std::string path(const std::string &file) const { return directory_ + "/" + file; }
   const std::string &directory() const { return directory_; }
@@ -26,6 +28,20 @@ private:
   std::string directory_ = "results";
   bool overwrite_ = false, progress_ = true;
   PetscReal fields_every_ = 0;
+};
+
+/// Times a fixed interval apart; what is due comes with the first step at or after each of them.
+class Schedule {
+public:
+  /// @p first: whether something is due at the start of the run.
+  Schedule(PetscReal every, bool first) : every_(every), next_(first ? 0 : every) {}
+  /// Whether something is due at time @p t; never if the interval is 0.
+  bool due(PetscReal t);
+  /// Goes on after time @p t.
+  void skip(PetscReal t);
+
+private:
+  PetscReal every_, next_; ///< s
 };
 
 /// Writes signals.csv.part row by row and renames it at the end.
@@ -45,7 +61,7 @@ private:
   std::FILE *file_ = nullptr;
 };
 
-/// One line a step.
+/// One line a step; the time left is foreseen from this session.
 class ProgressPrinter final : public Observer {
 public:
   ProgressPrinter(MPI_Comm comm, const SceneFacts &facts) : comm_(comm), facts_(facts) {}
@@ -55,13 +71,23 @@ private:
   MPI_Comm comm_;
   const SceneFacts &facts_;
   PetscLogDouble start_ = 0;
+  PetscReal from_ = -1; ///< time at which this session began, s
 };
 
 /// Writes the mesh once and a snapshot of the fields at phase ends or at intervals; P2 stays quadratic.
 class FieldWriter final : public Observer {
 public:
-  FieldWriter(const Output &output, const Scene &scene, Model &model) : output_(output), scene_(scene), model_(model) {}
+  FieldWriter(const Output &output, const Scene &scene, Model &model)
+      : output_(output), scene_(scene), model_(model), schedule_(output.fields_every(), true)
+  {}
   PetscErrorCode observe(const StepReport &step) override;
+  /// The snapshots so far.
+  PetscErrorCode persist(Archive &archive, Vec local) override;
+  /// Their files.
+  std::vector<std::string> files() const;
+  /// After persist() has read: lists the earlier snapshots again. Those of another directory @p from come along as
+  /// links (or copies); those that are no longer there are left out with a warning.
+  PetscErrorCode carry_over(const std::string &from);
   /// Writes a snapshot of @p local now.
   PetscErrorCode snapshot(PetscReal time, Vec local);
 
@@ -70,14 +96,22 @@ private:
   PetscErrorCode write_mesh();
   PetscErrorCode write_index() const;
 
+  struct Snapshot {
+    PetscReal time;         ///< s
+    std::string file, mesh; ///< in the output directory
+  };
+
   const Output &output_;
   const Scene &scene_;
   Model &model_;
   std::vector<PetscInt> nodes_;       ///< local mesh points that carry a node and are owned here
   std::vector<PetscInt> node_number_; ///< [local mesh point]: global node number, -1 without node
   PetscInt n_nodes_ = -1, n_cells_ = 0;
-  std::vector<PetscReal> times_;
-  PetscReal next_ = 0;
+  std::vector<Snapshot> snapshots_;
+  PetscInt count_ = 0;             ///< snapshots made, also those that are lost
+  std::string mesh_ = "fields.h5"; ///< nodes and cells of this session's snapshots
+  bool mesh_written_ = false;
+  Schedule schedule_;
 };
 
 /// What a run was watched by.

@@ -2,7 +2,7 @@
 /// The first guess of a time step, from the increments of the steps before it.
 #pragma once
 
-#include "pulmo/options.hpp"
+#include "pulmo/archive.hpp"
 
 #include <functional>
 #include <vector>
@@ -21,6 +21,8 @@ public:
 
   /// Begins a run at state @p X.
   PetscErrorCode begin(Vec X);
+  /// Writes or reads the increments that led to state @p X; reads as many as are in use.
+  PetscErrorCode persist(Archive &archive, Vec X);
   /// Takes note of an accepted state.
   PetscErrorCode accept(Vec X);
   /// Improves @p X, the state that a step starts from with the prescribed values of its end in place, and hands its

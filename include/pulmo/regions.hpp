@@ -25,6 +25,7 @@ public:
   /// After the model was built and the sampling set up.
   PetscErrorCode setup();
   PetscErrorCode observe(const StepReport &step) override;
+  PetscErrorCode persist(Archive &archive, Vec local) override;
 
   const std::vector<Mesh::Region> &regions() const { return regions_; }
   /// Reference volume of a region, ml.

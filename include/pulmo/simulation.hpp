@@ -3,16 +3,19 @@
 #pragma once
 
 #include "pulmo/airway.hpp"
+#include "pulmo/archive.hpp"
 #include "pulmo/clinical.hpp"
 #include "pulmo/lagging.hpp"
 #include "pulmo/model.hpp"
 #include "pulmo/predictor.hpp"
 #include "pulmo/scene.hpp"
+#include "pulmo/stop_signal.hpp"
 
 namespace pulmo {
 
 /// What an observer sees after each accepted step (and once at the start).
 struct StepReport {
+  const std::vector<SignalRow> &rows; ///< of the whole run so far, this one last
   SignalRow row;
   Measures measures;
   PetscReal mass_balance_error; ///< int (J - 1) - sum dt flow, mm^3
@@ -26,6 +29,8 @@ class Observer {
 public:
   virtual ~Observer() = default;
   virtual PetscErrorCode observe(const StepReport &) = 0;
+  /// Writes or reads what it remembers of the run so far. @p local: the state of the last row, as in StepReport.
+  virtual PetscErrorCode persist(Archive &, [[maybe_unused]] Vec local) { return PETSC_SUCCESS; }
 };
 
 /// An attempt at a step that was not accepted.
@@ -55,12 +60,18 @@ public:
   /// Counts what was done before the run as set-up, s.
   void setup_took(double seconds) { seconds_.setup = seconds; }
   void add(Observer &observer) { observers_.push_back(&observer); }
-  /// Runs to the end. @p finished is false if no step could be accepted any more; failure_text() then tells why.
+  /// Lets a signal end the run after the step at hand. @p signal must outlive the run.
+  void heed(StopSignal &signal) { stop_signal_ = &signal; }
+  /// Writes or reads the run after its last accepted step, observers included; after reading, run() goes on from there.
+  PetscErrorCode persist(Archive &archive);
+  /// Runs to the end. @p finished is false if a signal stopped the run, or if no step could be accepted any more;
+  /// failure_text() then tells why.
   PetscErrorCode run(bool &finished);
 
   Vec state() const { return state_; }        ///< global vector, the last accepted state
   Vec local_state() const { return before_; } ///< the same, local, constrained values in place
   PetscReal time() const { return accepted_.time; }
+  bool stopped() const { return stopped_; } ///< by a signal
   const std::vector<SignalRow> &rows() const { return rows_; }
   PetscReal mass_balance_error() const { return worst_balance_; } ///< largest of the run, mm^3
   PetscReal min_J() const { return min_J_; }
@@ -89,6 +100,13 @@ public:
 
 private:
   PetscErrorCode create_solver();
+  /// The row at t = 0.
+  PetscErrorCode start();
+  PetscErrorCode persist_rows(Archive &archive);
+  /// Finds the phase that goes on at what was read.
+  PetscErrorCode resume(const Archive &archive, PetscInt index, PetscReal wanted_dt, PetscReal phase_end);
+  /// Whether a signal asks to stop.
+  PetscErrorCode heed_signal();
   PetscErrorCode offer_fixed_stress(KSP ksp);
   /// Whether two times of this run are the same up to rounding.
   bool same(PetscReal t, PetscReal other) const;
@@ -111,6 +129,7 @@ private:
   Predictor predictor_;
   Lagging lagging_;
   std::vector<Observer *> observers_;
+  StopSignal *stop_signal_ = nullptr;
   TSHandle ts_;
   MatHandle matrix_;
   VecHandle state_, local_, rate_, local_residual_, before_;
@@ -118,6 +137,7 @@ private:
   std::vector<Phase> phases_;
   const Phase *phase_ = nullptr;
   PetscReal wanted_dt_ = 0.05, dt_ = 0.05; ///< asked for; in use before any shortening to land on a time
+  PetscReal next_dt_ = 0;                  ///< size of the step after the last accepted one, before any cut
   PetscReal end_ = 0;
   SignalRow accepted_;
   std::vector<SignalRow> rows_;
@@ -127,6 +147,8 @@ private:
   int extra_newton_ = 0;     ///< Newton steps of the attempt at hand for the prescribed volume alone
   bool inverted_ = false;    ///< the attempt at hand met J <= 0
   bool cut_ = false;         ///< the step at hand was cut
+  bool resumed_ = false;     ///< the run goes on from what was read
+  bool stopped_ = false;     ///< by a signal
   int crawled_ = 0;          ///< accepted steps in a row that were tiny
   Measures inverted_measures_;
   std::vector<FailedAttempt> failures_;

@@ -1,0 +1,577 @@
+#!/usr/bin/python3
+"""A run that was stopped, killed or failed goes on from its checkpoint as if nothing had happened; a file that is no
+checkpoint of the run is refused before anything is touched."""
+import os
+import random
+import re
+import resource
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+import unittest
+
+import h5py
+import meshio
+import numpy as np
+
+import pulmo_case as pulmo
+
+SAME_RANKS, OTHER_RANKS = 1e-10, 1e-8
+NOT_COMPARED = ("phase", "newton_iterations", "krylov_iterations")
+BASE = pulmo.TIGHT + pulmo.SCENE + pulmo.QUIET
+CUBE = BASE + pulmo.CUBE
+BREATH = ["-ventilator_inspiration", "0.3", "-ventilator_expiration", "0.3"]
+PCV = CUBE + ["-ventilator", "pcv", "-ventilator_pip", "6"] + BREATH
+# two breaths; the second begins at 0.4 s with a ramp of 0.1 s
+TWICE = ["-ventilator", "pcv", "-ventilator_pip", "6", "-ventilator_inspiration", "0.2", "-ventilator_expiration", "0.2",
+         "-ventilator_breaths", "2"]
+VCV = CUBE + ["-ventilator", "vcv", "-ventilator_tidal_volume", "0.2", "-ventilator_inspiration", "0.2",
+              "-ventilator_pause", "0.05", "-ventilator_expiration", "0.1", "-ventilator_breaths", "2"]
+LONG = PCV + ["-ventilator_breaths", "2000"]
+LIMITED = ("settle 0.1 pressure 2 ramp 0.05\ninspiration 0.6 flow 900 limit 6\n"
+           "expiration 0.3 pressure 0 ramp 0.2\n")
+TUBE = ["-tube", "-tube_k1", "6", "-tube_k2", "9"]
+
+
+def rows_so_far(directory, name="signals.csv.part"):
+    """Whole lines of the signals of a run, without the header."""
+    try:
+        with open(os.path.join(directory, name)) as f:
+            return [line.split(",") for line in f.read().split("\n")[1:-1]]
+    except FileNotFoundError:
+        return []
+
+
+def checkpoint_time(path):
+    with h5py.File(path) as f:
+        names = bytes(f["scalar_names"][:]).decode().split()
+        return dict(zip(names, f["scalars"][:, 0]))["time_s"]
+
+
+def alive(pid):
+    try:
+        with open(f"/proc/{pid}/stat") as f:
+            return f.read().rsplit(")")[-1].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+class Running:
+    """A run at work in the background."""
+
+    def __init__(self, options, directory, ranks=1):
+        command = [pulmo.PROGRAM] + [str(o) for o in options] + ["-output_dir", directory]
+        if ranks > 1:
+            command = pulmo.LAUNCHER + [str(ranks)] + command
+
+        self.directory = directory
+        self.process = subprocess.Popen(command, cwd=pulmo.SOURCE, env=pulmo.ENVIRONMENT, text=True,
+                                        stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
+                                        preexec_fn=lambda: signal.signal(signal.SIGXFSZ, signal.SIG_IGN))
+
+    def wait_for_rows(self, n, timeout=120):
+        end = time.monotonic() + timeout
+        while len(rows_so_far(self.directory)) < n:
+            if self.process.poll() is not None:
+                out, err = self.process.communicate()
+                raise AssertionError(f"ended too early: {out[-500:]} {err[-1500:]}")
+            if time.monotonic() > end:
+                self.end()
+                raise AssertionError(f"no {n} rows after {timeout} s")
+            time.sleep(0.005)
+
+    def workers(self):
+        """Process ids of the ranks."""
+        listed = subprocess.run(["ps", "-o", "pid=,comm=", "-g", str(os.getsid(self.process.pid))], text=True,
+                                stdout=subprocess.PIPE).stdout.split("\n")
+        name = os.path.basename(pulmo.PROGRAM)
+        return [int(line.split()[0]) for line in listed if line.split()[1:] == [name]]
+
+    def end(self, timeout=60):
+        """What it said, once it ended by itself."""
+        try:
+            out, err = self.process.communicate(timeout=timeout)
+        except subprocess.TimeoutExpired:
+            os.killpg(self.process.pid, signal.SIGKILL)
+            self.process.communicate()
+            raise AssertionError(f"no end after {timeout} s") from None
+        return self.process.returncode, out, err
+
+
+class RestartCase(unittest.TestCase):
+    def expect_same(self, reference, other, tolerance, after=0.0):
+        """Signals, energy balance and clinical numbers; rows are measured by what they are after a time."""
+        for name in ("signals.csv", "energy.csv"):
+            a, b = reference.signals(name), other.signals(name)
+            self.assertEqual(list(a), list(b))
+            self.assertEqual(len(a["time_s"]), len(b["time_s"]), "number of steps")
+            self.assertEqual(a.get("phase"), b.get("phase"))
+            for column in a:
+                if column in NOT_COMPARED or column == "residual_j":
+                    continue
+                scale = np.abs(a[column][a["time_s"] > after + 1e-9]).max()
+                self.assertLessEqual(np.abs(a[column] - b[column]).max(), tolerance * scale, f"{name} {column}")
+        rows = reference.signals()
+        self.assertGreater(rows["volume_ml"][rows["time_s"] > after + 1e-9].max(),
+                           0.01 * reference.json()["reference_volume_ml"], "the lung hardly moved")
+        a, b = reference.json(), other.json()
+        for key in ("steps", "effects", "cells", "dofs"):
+            self.assertEqual(a[key], b[key])
+        breaths = [a] + a["breaths"], [b] + b["breaths"]
+        self.assertEqual(len(breaths[0]), len(breaths[1]))
+        for x, y in zip(*breaths):
+            for key in ("peak_inspiratory_pressure_cmH2O", "tidal_volume_ml", "peak_flow_ml_per_s", "work_j",
+                        "plateau_pressure_cmH2O", "compliance_ml_per_cmH2O", "resistance_cmH2O_s_per_l"):
+                if x[key] is None:
+                    self.assertIsNone(y[key])
+                else: # fits divide by differences of the signals
+                    self.assertLessEqual(abs(x[key] - y[key]), 1e3 * tolerance * abs(x[key]), key)
+        self.assertLessEqual(abs(a["min_jacobian"] - b["min_jacobian"]), tolerance)
+        self.assertLess(b.get("mass_balance_error_ml", 0), 1e-9 * a["reference_volume_ml"])
+        for region, state in a["regions"].items():
+            for key in ("jacobian_mean", "ventilation_ml"):
+                if key in state:
+                    self.assertLessEqual(abs(state[key] - b["regions"][region][key]), tolerance * abs(state[key]))
+
+    def index(self, case):
+        """Times of fields.xdmf; all that it names must be there."""
+        with open(case.path("fields.xdmf")) as f:
+            text = f.read()
+        for name in set(re.findall(r">(fields[^:]*\.h5):", text)):
+            self.assertIn(name, case.files())
+        return [float(t) for t in re.findall(r'Time Value="([^"]*)"', text)]
+
+    def fields(self, case, time_s):
+        """Displacements at a time, by coordinates of the nodes."""
+        with open(case.path("fields.xdmf")) as f:
+            snapshots = f.read().split("<Grid Name=\"step\"")[1:]
+        text = next(s for s in snapshots if abs(float(re.search(r'Time Value="([^"]*)"', s)[1]) - time_s) < 1e-9)
+        with h5py.File(case.path(re.search(r">([^:>]*):/geometry", text)[1])) as f:
+            x = f["geometry"][:]
+        with h5py.File(case.path(re.search(r">([^:>]*):/displacement", text)[1])) as f:
+            u = f["displacement"][:].reshape(-1, 3)
+        return u[np.lexsort(np.round(x, 6).T)]
+
+    def expect_error(self, code, err, *words):
+        self.assertNotIn(code, (0, None), err)
+        self.assertEqual(err.count("pulmo: error:"), 1, err)
+        for noise in ("PETSC ERROR", "HDF5-DIAG"):
+            self.assertNotIn(noise, err)
+        for word in words:
+            self.assertIn(word, err)
+
+
+class Agreement(RestartCase):
+    """Each scene: a whole run that keeps a checkpoint at a time in the second half; from there once more."""
+    SCENES = {
+        # the second breath's rise of pressure
+        "pcv": (CUBE + TWICE, 0.45),
+        # the second breath's flow
+        "vcv": (VCV, 0.45),
+        "vcv, common pressure": (VCV + pulmo.COMMON, 0.45),
+        "vcv, no airflow": (VCV + pulmo.STILL, 0.45),
+        "pcv, no airflow, pins": (CUBE + TWICE + pulmo.STILL + pulmo.PINS +
+                                  ["-chest_wall", "off", "-tissue", "ma", "-ventilator_pip", "4"], 0.45),
+        # the limit is held
+        "limit and tube": (BASE + pulmo.LITRE + TUBE + pulmo.programme(LIMITED), 0.55),
+        # a ramp from what the ventilator had when the phase began
+        "ramp": (BASE + pulmo.LITRE + pulmo.programme(LIMITED), 0.8),
+        "predictor": (CUBE + TWICE + ["-predictor_increments", "2"], 0.45),
+        # steps were cut and grow again
+        "cut steps": (PCV + ["-snes_max_it", "5", "-ventilator_ramp_down", "0.2"], 0.31),
+    }
+
+    def run_scene(self, name, first=1, then=(1, 2)):
+        options, at = self.SCENES[name]
+        reference = pulmo.finished(options + ["-checkpoint_every", at], ranks=first)
+        self.assertLess(reference.json()["end_time_s"], 2 * at, "there is more than one checkpoint before the end")
+        rows = reference.signals()
+        kept = checkpoint_time(reference.path("checkpoint_previous.h5"))
+        self.assertAlmostEqual(kept, rows["time_s"][rows["time_s"] >= at - 1e-9][0], 12, "the first step at or after")
+        self.assertAlmostEqual(checkpoint_time(reference.path("checkpoint.h5")), rows["time_s"][-1], 12)
+        for ranks in then:
+            with self.subTest(name, ranks=ranks):
+                other = pulmo.finished(options + ["-restart", reference.path("checkpoint_previous.h5")], ranks=ranks)
+                self.assertIn(f"t = {kept:.6g} s", other.out)
+                self.expect_same(reference, other, SAME_RANKS if ranks == first else OTHER_RANKS, kept)
+                times = self.index(reference)
+                self.assertEqual(self.index(other), times)
+                u = self.fields(reference, times[-1]), self.fields(other, times[-1])
+                np.testing.assert_allclose(*u, rtol=0, atol=OTHER_RANKS * np.abs(u[0]).max() + 1e-14)
+        return reference
+
+    def test_scenes(self):
+        for name in self.SCENES:
+            reference = self.run_scene(name, then=(1, 2) if name in ("vcv", "vcv, no airflow") else (1,))
+            if name == "cut steps":
+                self.assertGreater(reference.json()["rejected_steps"], 0)
+            if name == "limit and tube":
+                rows = reference.signals()
+                held = np.abs(rows["ventilator_pressure_cmH2O"] - 6) < 1e-9
+                self.assertTrue(held[rows["time_s"] == 0.5].all() and held.sum() > 3, "the limit was reached")
+
+    def test_from_two_ranks(self):
+        self.run_scene("limit and tube", first=2, then=(1, 3))
+        self.run_scene("vcv, common pressure", first=2, then=(2,))
+
+    def test_other_solvers(self):
+        """A kept Jacobian is not in the file: agreement is that of the solver's tolerance."""
+        tolerance = 1e-6 # -snes_rtol of the solver files
+        for solver in ("iterative", "reuse"):
+            with self.subTest(solver):
+                options = pulmo.options_file(f"solvers/{solver}.opts") + (CUBE + TWICE)[len(pulmo.TIGHT):]
+                reference = pulmo.finished(options + ["-checkpoint_every", "0.45"])
+                other = pulmo.finished(options + ["-restart", reference.path("checkpoint_previous.h5")])
+                a, b = reference.signals()["volume_ml"], other.signals()["volume_ml"]
+                self.assertGreater(a[-8:].max(), 0.5 * a.max(), "there is something to compare")
+                self.assertEqual(len(a), len(b))
+                self.assertLess(np.abs(a - b).max(), 10 * tolerance * a.max())
+
+    def test_longer_run_in_the_same_directory(self):
+        """Snapshots and rows after the checkpoint give way; a later end is no other scene."""
+        every = ["-output_fields_every", "0.1", "-checkpoint_every", "0.25"]
+        reference = pulmo.finished(PCV + every)
+        short = pulmo.finished(PCV + every + ["-ts_max_time", "0.45"])
+        self.assertAlmostEqual(checkpoint_time(short.path("checkpoint.h5")), short.signals()["time_s"][-1], 12)
+        case = pulmo.Case(PCV + every + ["-restart", short.path("checkpoint_previous.h5")], directory=short.directory)
+        self.expect_error(case.code, case.err, "holds a finished run", "-output_overwrite")
+        longer = pulmo.finished(PCV + every + ["-restart", short.path("checkpoint_previous.h5"), "-output_overwrite"],
+                                directory=short.directory, ranks=2)
+        self.expect_same(reference, longer, OTHER_RANKS)
+        self.assertEqual(self.index(longer), self.index(reference))
+        for t in (0.2, 0.4):
+            u = self.fields(reference, t), self.fields(longer, t)
+            np.testing.assert_allclose(*u, rtol=0, atol=OTHER_RANKS * np.abs(u[0]).max())
+        # snapshots that are gone are missed, no more
+        alone = pulmo.scratch("alone.h5")
+        shutil.copy(short.path("checkpoint.h5"), alone)
+        rest = pulmo.Case(PCV + every + ["-restart", alone, "-ventilator_breaths", "2", "-ts_max_time", "0.7"])
+        self.assertEqual(rest.code, 0, rest.tail())
+        self.assertIn("earlier snapshots are not in", rest.out)
+        self.assertEqual(self.index(rest), [t for t in (0.6, 0.7) if t > checkpoint_time(alone) + 1e-9])
+
+    def test_later_phases_may_change(self):
+        first = "in 0.2 pressure 5\nout 0.2 pressure 0\n"
+        other = CUBE + pulmo.programme(first + "in 0.2 pressure 3\n")
+        once = pulmo.finished(CUBE + pulmo.programme(first) + ["-checkpoint_every", "0.3"])
+        reference = pulmo.finished(other)
+        self.expect_same(reference, pulmo.finished(other + ["-restart", once.path("checkpoint_previous.h5")]),
+                         SAME_RANKS)
+
+
+class Meshes(RestartCase):
+    """Nodes are told apart by where they are, not by their numbers."""
+
+    def write(self, points, blocks, name):
+        """Blocks of (kind, cells, physical tag) with the names of cube_lung.msh."""
+        path = pulmo.scratch(name + ".msh")
+        cells = [(kind, c) for kind, c, _ in blocks]
+        tags = [np.asarray(t) for _, _, t in blocks]
+        meshio.write(path, meshio.Mesh(points, cells, cell_data={"gmsh:physical": tags, "gmsh:geometrical": tags},
+                                       field_data=self.cube.field_data), file_format="gmsh22", binary=False)
+        return ["-dm_plex_filename", path]
+
+    def setUp(self):
+        self.cube = meshio.read(pulmo.mesh("cube_lung.msh"))
+        self.blocks = [(kind, self.cube.cells_dict[kind], self.cube.cell_data_dict["gmsh:physical"][kind])
+                       for kind in ("triangle", "tetra")]
+
+    def test_renumbered(self):
+        random_numbers = np.random.default_rng(1)
+        new = random_numbers.permutation(len(self.cube.points)) # [old number]
+        points = np.empty_like(self.cube.points)
+        points[new] = self.cube.points
+        blocks = []
+        for kind, cells, tags in self.blocks:
+            order = random_numbers.permutation(len(cells))
+            blocks.append((kind, new[cells][order], tags[order]))
+        renumbered = self.write(points, blocks, "renumbered") + ["-mesh_scale", "1"]
+        options = CUBE + TWICE + ["-checkpoint_every", "0.45"]
+        reference = pulmo.finished(options)
+        other = pulmo.finished(options + renumbered + ["-restart", reference.path("checkpoint_previous.h5")])
+        self.expect_same(reference, other, OTHER_RANKS, after=0.45)
+
+    def test_nodes_at_one_place(self):
+        """Two blocks that touch without being joined: there are two nodes at each place of the fissure."""
+        mirrored = self.cube.points * [-1, 1, 1]
+        n = len(self.cube.points)
+        blocks = list(self.blocks)
+        for kind, cells, tags in self.blocks:
+            blocks.append((kind, cells[:, [1, 0] + list(range(2, cells.shape[1]))] + n, tags))
+        mesh = self.write(np.vstack([self.cube.points, mirrored]), blocks, "touching") + ["-mesh_scale", "1"]
+        options = CUBE + TWICE + mesh + ["-checkpoint_every", "0.45"]
+        reference = pulmo.finished(options)
+        other = pulmo.finished(options + ["-restart", reference.path("checkpoint_previous.h5")], ranks=2)
+        with h5py.File(reference.path("checkpoint.h5")) as f:
+            self.assertEqual(len(f["state/pressure"]), 2 * n)
+        with h5py.File(reference.path("fields.h5")) as f:
+            fissure = f["geometry"][:][:, 0] == 0
+        with h5py.File(reference.path("fields_00003.h5")) as f: # at 0.6 s
+            u = f["displacement"][:].reshape(-1, 3)[fissure, 0]
+        self.assertGreater(u.max(), 0.1)
+        self.assertLess(u.min(), -0.1, "the sides of the fissure move differently")
+        self.expect_same(reference, other, OTHER_RANKS, after=0.45)
+
+
+class Signals(RestartCase):
+    """Asked to stop, a run leaves a checkpoint after the step at hand."""
+
+    def expect_stopped(self, run, name):
+        code, _, err = run.end()
+        self.expect_error(code, err, f"stopped by {name}", "-restart " + os.path.join(run.directory, "checkpoint.h5"))
+        rows = rows_so_far(run.directory)
+        files = os.listdir(run.directory)
+        for left in ("summary.json", "signals.csv", "checkpoint.h5.part"):
+            self.assertNotIn(left, files)
+        self.assertAlmostEqual(checkpoint_time(os.path.join(run.directory, "checkpoint.h5")), float(rows[-1][0]),
+                               delta=1e-12)
+        return float(rows[-1][0])
+
+    def test_signals(self):
+        for name in ("SIGTERM", "SIGINT"):
+            with self.subTest(name):
+                run = Running(LONG, pulmo.scratch())
+                run.wait_for_rows(3)
+                run.process.send_signal(getattr(signal, name))
+                t = self.expect_stopped(run, name)
+        # an accident does not replace it
+        case = pulmo.Case(LONG, directory=run.directory)
+        self.expect_error(case.code, case.err, "holds the checkpoint of an unfinished run", "-restart")
+        # and on, in the same directory
+        end = ["-ts_max_time", repr(t + 0.1)]
+        restart = ["-restart", os.path.join(run.directory, "checkpoint.h5")]
+        reference = pulmo.finished(LONG + end)
+        other = pulmo.finished(LONG + end + restart, directory=run.directory)
+        self.expect_same(reference, other, SAME_RANKS)
+
+    def test_signals_under_mpiexec(self):
+        def all_ranks(run, sig):
+            for pid in run.workers():
+                os.kill(pid, sig)
+
+        for name, send in (("SIGTERM", all_ranks),
+                           ("SIGTERM", lambda run, sig: os.kill(run.workers()[1], sig)),
+                           ("SIGUSR1", lambda run, sig: run.process.send_signal(sig))): # mpiexec passes it on
+            run = Running(LONG, pulmo.scratch(), ranks=2)
+            run.wait_for_rows(2)
+            self.assertEqual(len(run.workers()), 2)
+            send(run, getattr(signal, name))
+            self.expect_stopped(run, name)
+
+    def test_signal_to_mpiexec(self):
+        """mpiexec leaves its ranks a second or so; whatever is left is whole."""
+        run = Running(LONG + ["-checkpoint_every", "0.05"], pulmo.scratch(), ranks=2)
+        run.wait_for_rows(3)
+        run.process.send_signal(signal.SIGTERM)
+        code, _, _ = run.end()
+        self.assertNotEqual(code, 0)
+        self.assertGreaterEqual(checkpoint_time(os.path.join(run.directory, "checkpoint.h5")),
+                                float(rows_so_far(run.directory)[-1][0]) - 0.05 - 1e-9)
+
+    def test_second_signal(self):
+        """A step that never ends does not keep the run from ending."""
+        endless = ["-snes_rtol", "0", "-snes_atol", "0", "-snes_max_it", "100000000", "-snes_linesearch_type", "basic"]
+        run = Running(LONG + endless, pulmo.scratch())
+        run.wait_for_rows(1)
+        time.sleep(0.3)
+        run.process.send_signal(signal.SIGTERM)
+        time.sleep(3.2)
+        self.assertIsNone(run.process.poll(), "the step was to go on")
+        run.process.send_signal(signal.SIGTERM)
+        self.assertEqual(run.end(timeout=10)[0], -signal.SIGTERM)
+
+    def test_killed_rank(self):
+        run = Running(LONG, pulmo.scratch(), ranks=2)
+        run.wait_for_rows(2)
+        ranks = run.workers()
+        os.kill(ranks[1], signal.SIGKILL)
+        self.assertNotEqual(run.end()[0], 0)
+        for pid in ranks:
+            self.assertFalse(alive(pid), "a rank lives on")
+
+
+class Faults(RestartCase):
+    def test_killed_again_and_again(self):
+        """20 times kill -9 at a random moment and on from what is there: at most an interval is lost each time."""
+        every, dt, kills = 0.1, 0.05, 20
+        moments = random.Random(5)
+        directory, options = tempfile.mkdtemp(dir=os.path.dirname(pulmo.scratch())), LONG + ["-checkpoint_every", every]
+        restart, last = [], 0.0
+        for kill in range(kills):
+            run = Running(options + restart, directory)
+            if kill % 4: # after its first step; else perhaps even before
+                run.wait_for_rows(1)
+            time.sleep(moments.uniform(0, 0.4))
+            self.assertIsNone(run.process.poll())
+            run.process.kill()
+            run.end()
+            files = os.listdir(directory)
+            rows = rows_so_far(directory)
+            if rows:
+                os.remove(os.path.join(directory, "signals.csv.part")) # the next session's first step brings it back
+            if "checkpoint.h5" not in files:
+                self.assertEqual(restart, [], "a checkpoint that was there is gone")
+                self.assertLess(float(rows[-1][0]) if rows else 0, every + dt + 1e-9)
+                continue
+            kept = [checkpoint_time(os.path.join(directory, f)) for f in ("checkpoint.h5", "checkpoint_previous.h5")
+                    if f in files]
+            self.assertGreaterEqual(kept[0], last, "never back")
+            self.assertEqual(kept, sorted(kept, reverse=True))
+            self.assertGreaterEqual(kept[0], float(rows[-1][0]) - every - dt / 2 if rows else 0)
+            last, restart = kept[0], ["-restart", os.path.join(directory, "checkpoint.h5")]
+        self.assertGreater(last, 0.5, "the run got on")
+        end = ["-ts_max_time", repr(last + 0.1)]
+        other = pulmo.finished(options + restart + end, directory=directory)
+        self.expect_same(pulmo.finished(LONG + end), other, SAME_RANKS)
+
+    def started(self):
+        """A directory with two checkpoints of a run that may go on, and their bytes."""
+        case = pulmo.finished(PCV + ["-checkpoint_every", "0.1", "-ts_max_time", "0.2"])
+        for name in ("summary.json", "signals.csv"):
+            os.remove(case.path(name))
+        return case, self.contents(case.directory)
+
+    def contents(self, directory):
+        found = {}
+        for name in ("checkpoint.h5", "checkpoint_previous.h5"):
+            with open(os.path.join(directory, name), "rb") as f:
+                found[name] = f.read()
+        return found
+
+    def test_full_disk(self):
+        case, before = self.started()
+        limit = 45 * 1024 # more than a snapshot, less than a checkpoint
+        self.assertGreater(len(before["checkpoint.h5"]), limit)
+        run = Running(LONG + ["-restart", case.path("checkpoint.h5"), "-checkpoint_every", "1"], case.directory)
+        run.wait_for_rows(1)
+        resource.prlimit(run.process.pid, resource.RLIMIT_FSIZE, (limit, limit))
+        code, _, err = run.end()
+        self.expect_error(code, err, "cannot write " + case.path("checkpoint.h5"), "File too large", "free the disk")
+        self.assertEqual(self.contents(case.directory), before)
+        self.assertNotIn("checkpoint.h5.part", case.files())
+
+    def test_unwritable(self):
+        case, before = self.started()
+        os.makedirs(case.path("checkpoint.h5.part/in_the_way"))
+        for ranks in (1, 2):
+            again = pulmo.Case(PCV + ["-restart", case.path("checkpoint.h5"), "-checkpoint_every", "0.1"], ranks=ranks,
+                               directory=case.directory)
+            self.expect_error(again.code, again.err, "cannot write " + case.path("checkpoint.h5"))
+            self.assertEqual(self.contents(case.directory), before)
+
+    @unittest.skipIf(os.geteuid() == 0, "root writes everywhere")
+    def test_read_only_directory(self):
+        case, before = self.started()
+        os.chmod(case.directory, 0o500)
+        try:
+            again = pulmo.Case(PCV + ["-restart", case.path("checkpoint.h5")], directory=case.directory)
+        finally:
+            os.chmod(case.directory, 0o700)
+        self.expect_error(again.code, again.err, "cannot be written")
+        self.assertEqual(self.contents(case.directory), before)
+
+    def test_failed_run(self):
+        """A run that no solver step gets on leaves its last good state; another solver goes on from there."""
+        options = CUBE + pulmo.programme("rest 0.1 pressure 0\npush 0.2 pressure 5\n")
+        failed = pulmo.Case(options + ["-snes_max_it", "1"])
+        self.expect_error(failed.code, failed.err, "no step could be accepted",
+                          "-restart " + failed.path("checkpoint.h5"))
+        other = pulmo.finished(options + ["-restart", failed.path("checkpoint.h5")])
+        self.expect_same(pulmo.finished(options), other, SAME_RANKS)
+
+
+class BadFiles(RestartCase):
+    @classmethod
+    def setUpClass(cls):
+        cls.good = pulmo.finished(PCV + ["-checkpoint_every", "0.1", "-ts_max_time", "0.4"]).path("checkpoint.h5")
+        with open(cls.good, "rb") as f:
+            cls.image = f.read()
+
+    def refused(self, path, *words, options=(), ranks=1):
+        case = pulmo.Case(PCV + ["-restart", path] + list(options), ranks=ranks)
+        self.expect_error(case.code, case.err, "-restart", *words)
+        self.assertFalse(os.path.exists(case.directory), "something was touched")
+
+    def file(self, content):
+        path = pulmo.scratch("spoilt.h5")
+        with open(path, "wb") as f:
+            f.write(content)
+        return path
+
+    def changed(self, change):
+        path = self.file(self.image)
+        with h5py.File(path, "r+") as f:
+            change(f)
+        return path
+
+    def test_no_checkpoint(self):
+        self.refused("/nowhere/checkpoint.h5", "/nowhere/checkpoint.h5", "no such file")
+        self.refused(pulmo.SOURCE, "no such file")
+        for ranks in (1, 2):
+            self.refused(self.file(b"volume_ml\n1\n"), "no HDF5 file", ranks=ranks)
+        foreign = pulmo.scratch("foreign.h5")
+        with h5py.File(foreign, "w") as f:
+            f["state/displacement"] = np.zeros((231, 3))
+        self.refused(foreign, "no checkpoint of pulmo")
+
+    def test_truncated(self):
+        for length in (0, 7, 100, len(self.image) // 2, len(self.image) - 1):
+            with self.subTest(length):
+                word = "no HDF5 file" if length < 8 else "truncated or damaged"
+                self.refused(self.file(self.image[:length]), word, ranks=2 if length == 100 else 1)
+
+    def test_spoilt(self):
+        def next_format(f):
+            f.attrs.modify("pulmo_checkpoint", np.int32(f.attrs["pulmo_checkpoint"] + 1))
+
+        self.refused(self.changed(next_format), "has format 2", "reads format 1")
+        for name in ("signals", "state/pressure", "scalars"):
+            with self.subTest(name):
+                def drop(f):
+                    del f[name]
+                self.refused(self.changed(drop), f"'{name}' is damaged or missing", ranks=2 if name == "signals" else 1)
+
+        def shorten(f):
+            values = f["state/displacement"][:-1]
+            del f["state/displacement"]
+            f["state/displacement"] = values
+        self.refused(self.changed(shorten), "'state/displacement' is damaged or missing")
+        with h5py.File(self.good) as f: # a bit of one displacement
+            place = f["state/displacement"].id.get_chunk_info(0).byte_offset + 1000
+        spoilt = bytearray(self.image)
+        spoilt[place] ^= 4
+        self.refused(self.file(bytes(spoilt)), "'state/displacement' is damaged or missing")
+
+    def test_another_run(self):
+        for options, words in (
+                (["-mesh_scale", "1.0000001"], ["of another mesh", "-mesh_scale"]),
+                (["-dm_plex_filename", pulmo.mesh("cube_msh41_ascii.msh"), "-mesh_scale", "10"],
+                 ["of another mesh", "45 vertices", "14 vertices"]),
+                (["-tissue", "ma"], ["of another scene", "-tissue is 'birzle', here 'ma'"]),
+                (["-tissue_beta", "1.1"], ["of another scene", "-tissue_beta is '1.075', here '1.1'"]),
+                (["-tube", "-tube_k1", "1"], ["of another scene", "-tube is 'off'"]),
+                (["-airflow", "off"], ["of another scene", "-airflow"]),
+                (["-energy_audit", "off"], ["of another scene", "-energy_audit"]),
+                (["-quadrature_degree", "4"], ["of another scene", "-quadrature_degree"]),
+                (["-ventilator_pip", "7"], ["of another scene", "phase 1", "inspiration"]),
+                (["-ventilator_expiration", "0.4"], ["of another scene", "phase 2", "expiration", "0.3 to 0.6 s"]),
+                (["-ventilator", "off"], ["of another scene", "-ventilator"]),
+                (["-ts_max_time", "0.4"], ["nothing is left to run", "-ts_max_time"])):
+            with self.subTest(" ".join(options)):
+                self.refused(self.good, *words, options=options)
+        # the same in other words
+        same = ["-airflow_permeability", "10000.0", "-chest_wall", "true", "-ts_max_time", "0.45"]
+        pulmo.finished(PCV + same + ["-restart", self.good])
+
+    def test_options(self):
+        case = pulmo.Case(PCV + ["-checkpoint_every", "-1"])
+        self.expect_error(case.code, case.err, "-checkpoint_every", ">= 0")
+        helped = pulmo.Case(["-help"], directory="-")
+        for name in ("-checkpoint_every", "-restart"):
+            self.assertIn(name, helped.out)
+
+
+if __name__ == "__main__":
+    pulmo.main()
