@@ -45,6 +45,7 @@ PetscErrorCode Output::prepare(const Options &options, const std::string &restar
   const MPI_Comm comm = options.comm();
   PetscMPIInt rank;
   bool free = true, unfinished = false, writable = true, continues = false;
+  std::string left; // a checkpoint of an earlier run
 
   PetscFunctionBeginUser;
   PetscCallMPI(MPI_Comm_rank(comm, &rank));
@@ -52,7 +53,9 @@ PetscErrorCode Output::prepare(const Options &options, const std::string &restar
     std::error_code error;
     continues = !restart.empty() && fs::equivalent(fs::absolute(restart).parent_path(), directory_, error) && !error;
     free = overwrite_ || !fs::exists(path("summary.json"), error);
-    unfinished = !overwrite_ && !continues && fs::exists(path("checkpoint.h5"), error);
+    for (const char *name : {"checkpoint_previous.h5", "checkpoint.h5"})
+      if (fs::exists(path(name), error)) left = path(name);
+    unfinished = !overwrite_ && !continues && !left.empty();
     if (free && !unfinished) {
       fs::create_directories(directory_, error);
       const std::string probe = path(".pulmo_probe");
@@ -70,7 +73,7 @@ PetscErrorCode Output::prepare(const Options &options, const std::string &restar
   PulmoUserCheck(!unfinished, comm,
                  "-output_dir %s holds the checkpoint of an unfinished run: go on with -restart %s, or give another "
                  "directory or -output_overwrite",
-                 directory_.c_str(), path("checkpoint.h5").c_str());
+                 directory_.c_str(), left.c_str());
   PulmoUserCheck(writable, comm, "-output_dir %s cannot be written; choose another directory or free the disk",
                  directory_.c_str());
   if (rank == 0) { // what an earlier run left must not pass for this one's

@@ -77,7 +77,6 @@ PetscErrorCode Simulation::persist(Archive &archive)
   PetscCall(archive.value("dt_asked_s", wanted_dt));
   PetscCall(archive.value("dt_s", dt_));
   PetscCall(archive.value("dt_next_s", next_dt_));
-  PetscCall(archive.value("tiny_steps", crawled_));
   PetscCall(archive.value("rejected_steps", rejected_));
   PetscCall(archive.value("delivered_mm3", delivered_));
   PetscCall(archive.value("mass_balance_error_mm3", worst_balance_));
