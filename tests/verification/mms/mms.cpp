@@ -581,8 +581,10 @@ TYPED_TEST(ManufacturedRun, OrderInTime)
                     order(e[e.size() - 2].p, e.back().p));
       std::printf("\n");
     }
-    EXPECT_NEAR(order(e[2].u, e[3].u), integrator.order, 0.05);
-    EXPECT_NEAR(order(e[2].p, e[3].p), integrator.order, 0.05);
+    for (const double measured : {order(e[2].u, e[3].u), order(e[2].p, e[3].p)}) { // BDF2 comes from above
+      EXPECT_GT(measured, integrator.order - 0.05);
+      EXPECT_LT(measured, integrator.order + 0.1);
+    }
     EXPECT_GT(e[3].u, 1e-8);
     EXPECT_LT(e[3].u, 1e-2);
   }

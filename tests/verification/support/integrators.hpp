@@ -12,6 +12,7 @@ struct Integrator {
 
 constexpr Integrator integrators[] = {
     {"backward Euler", " -ts_type beuler", 1},
+    {"BDF2", " -ts_type bdf", 2},
 };
 
 } // namespace pulmo::test
