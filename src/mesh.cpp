@@ -1,13 +1,16 @@
 #include "pulmo/mesh.hpp"
 
+#include "pulmo/msh.hpp"
 #include "pulmo/units.hpp"
 
 #include <algorithm>
 #include <array>
 #include <cmath>
-#include <cstdio>
+#include <filesystem>
+#include <fstream>
 #include <iterator>
 #include <numeric>
+#include <sstream>
 
 namespace pulmo {
 
@@ -42,39 +45,56 @@ PetscErrorCode has_curved_cells(DM dm, bool &curved)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-/// Reads the file on rank 0 alone so that an unreadable mesh is one clear error on all ranks.
-PetscErrorCode check_file(MPI_Comm comm, const std::string &file)
+/// Whether PETSc takes a file of this name for gmsh's.
+bool is_msh(const std::string &file)
 {
-  PetscMPIInt rank;
-  int found = 1, readable = 1;
+  const std::string extension = std::filesystem::path(file).extension();
+  return extension == ".msh" || extension == ".msh2" || extension == ".msh4";
+}
+
+/// Reads the file on this rank; @p fault tells what is wrong with it (msh_fault()), or is empty.
+PetscErrorCode find_fault(const std::string &file, std::string &fault)
+{
+  std::error_code error;
+  std::ifstream in;
+  DMHandle trial;
   bool curved = false;
 
   PetscFunctionBeginUser;
-  PetscCallMPI(MPI_Comm_rank(comm, &rank));
-  if (rank == 0) {
-    std::FILE *f = std::fopen(file.c_str(), "rb");
-    found = f != nullptr;
-    if (f) {
-      DMHandle trial;
-      char first = 0;
-      found = std::fread(&first, 1, 1, f) == 1;
-      std::fclose(f);
-      PetscCall(PetscPushErrorHandler(PetscReturnErrorHandler, nullptr));
-      readable = found && DMPlexCreateFromFile(PETSC_COMM_SELF, file.c_str(), "pulmo", PETSC_FALSE, trial.out()) == 0;
-      PetscCall(PetscPopErrorHandler());
-      if (readable) PetscCall(has_curved_cells(trial, curved));
-    }
+  if (std::filesystem::is_regular_file(file, error)) in.open(file, std::ios::binary);
+  if (!in.is_open() || in.peek() == std::ifstream::traits_type::eof()) {
+    fault = "cannot be read: there is no such file, or it is empty; check its name";
+  } else if (is_msh(file)) {
+    std::ostringstream content;
+    content << in.rdbuf();
+    fault = msh_fault(content.str());
+  } else { // another format of PETSc's
+    PetscCall(PetscPushErrorHandler(PetscReturnErrorHandler, nullptr));
+    const bool readable = DMPlexCreateFromFile(PETSC_COMM_SELF, file.c_str(), "pulmo", PETSC_FALSE, trial.out()) == 0;
+    PetscCall(PetscPopErrorHandler());
+    if (readable) PetscCall(has_curved_cells(trial, curved));
+    if (!readable)
+      fault = "is not a readable mesh; pulmo reads gmsh's MSH 2.2 and 4.1 (ASCII or binary), in files that end in .msh";
+    else if (curved)
+      fault = "holds elements of higher order; save it with straight ones";
   }
-  PetscCallMPI(MPI_Bcast(&found, 1, MPI_INT, 0, comm));
-  PetscCallMPI(MPI_Bcast(&readable, 1, MPI_INT, 0, comm));
-  PetscCallMPI(MPI_Bcast(&curved, 1, MPI_CXX_BOOL, 0, comm));
-  PulmoUserCheck(found, comm, "-dm_plex_filename %s: there is no such file, or it is empty", file.c_str());
-  PulmoUserCheck(readable, comm,
-                 "-dm_plex_filename %s is not a readable mesh; pulmo reads gmsh's MSH 2.2 and 4.1 (ASCII or binary)",
-                 file.c_str());
-  PulmoUserCheck(!curved, comm,
-                 "-dm_plex_filename %s holds elements of higher order; save it with straight ones (gmsh -order 1)",
-                 file.c_str());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Looks at the file on rank 0 alone so that an unreadable mesh is one clear error on all ranks.
+PetscErrorCode check_file(MPI_Comm comm, const std::string &file)
+{
+  PetscMPIInt rank;
+  std::string fault;
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  if (rank == 0) PetscCall(find_fault(file, fault));
+  auto length = static_cast<int>(fault.size());
+  PetscCallMPI(MPI_Bcast(&length, 1, MPI_INT, 0, comm));
+  fault.resize(static_cast<std::size_t>(length));
+  PetscCallMPI(MPI_Bcast(fault.data(), length, MPI_CHAR, 0, comm));
+  PulmoUserCheck(fault.empty(), comm, "-dm_plex_filename %s %s", file.c_str(), fault.c_str());
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -188,13 +208,6 @@ PetscErrorCode next_body(MPI_Comm comm, const std::vector<PetscInt> &body, Petsc
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-/// Labels that are not physical names of the mesh.
-bool own_label(const std::string &name)
-{
-  const std::string own[] = {"celltype", "depth", "ghost", "marker", "Cell Sets", "Face Sets", "vtk"};
-  return std::find(std::begin(own), std::end(own), name) != std::end(own);
-}
-
 /// Mesh points in [begin, end) that a label marks, in order.
 PetscErrorCode labelled_points(DM dm, const char *name, PetscInt begin, PetscInt end, std::vector<PetscInt> &points)
 {
@@ -240,6 +253,7 @@ PetscErrorCode Mesh::read(const Options &options, bool ventilated)
 
   // one label per physical name
   PetscCall(PetscOptionsSetValue(nullptr, "-dm_plex_gmsh_use_regions", "true"));
+  PetscCall(PetscOptionsSetValue(nullptr, "-dm_plex_gmsh_periodic", "false")); // a lung is not periodic
   // cells that are neighbours in space become neighbours in memory: mesh generators number them at random, and then
   // assembly, products and smoothers mostly wait for memory
   PetscCall(PetscOptionsHasName(nullptr, nullptr, "-dm_plex_reorder", &given));
@@ -357,7 +371,7 @@ PetscErrorCode Mesh::find_surfaces(const Options &options)
     PetscReal area = 0;
 
     PetscCall(DMGetLabelName(dm_, l, &name));
-    if (own_label(name)) continue;
+    if (is_petsc_label(name)) continue;
     PetscCall(DMGetLabel(dm_, name, &label));
     PetscCall(DMLabelGetValueIS(label, values_is.out()));
     PetscCall(ISGetLocalSize(values_is, &n_values));
@@ -525,7 +539,7 @@ PetscErrorCode Mesh::regions(std::vector<Region> &list) const
     const char *name;
     Region region;
     PetscCall(DMGetLabelName(dm_, l, &name));
-    if (own_label(name)) continue;
+    if (is_petsc_label(name)) continue;
     PetscCall(labelled_points(dm_, name, begin, end, region.cells));
     auto found = static_cast<PetscInt>(region.cells.size());
     PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &found, 1, MPIU_INT, MPI_SUM, comm));
