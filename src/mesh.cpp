@@ -10,6 +10,7 @@
 #include <fstream>
 #include <iterator>
 #include <numeric>
+#include <set>
 #include <sstream>
 
 namespace pulmo {
@@ -436,6 +437,51 @@ PetscErrorCode Mesh::require_surfaces(const std::vector<std::string> &names, con
     PulmoUserCheck(surfaces_.count(name), PetscObjectComm((PetscObject)(DM)dm_),
                    "the mesh %s has no surface '%s', which %s asks for; it has %s: name one of these", file_.c_str(),
                    name.c_str(), option.c_str(), surface_names().c_str());
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Mesh::require_openings(const std::vector<std::string> &names, const std::string &option) const
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
+  PetscInt begin, end, last = -1;
+  std::vector<PetscInt> body;
+  std::set<PetscInt> open; // bodies
+
+  PetscFunctionBeginUser;
+  PetscCall(DMPlexGetDepthStratum(dm_, 0, &begin, &end));
+  PetscCall(find_bodies(dm_, begin, end, body));
+  for (const std::string &name : names) {
+    std::vector<PetscInt> points;
+    PetscCall(facets(name, points));
+    for (const PetscInt facet : points) {
+      const PetscInt *cone;
+      PetscCall(DMPlexGetCone(dm_, facet, &cone));   // edges
+      PetscCall(DMPlexGetCone(dm_, cone[0], &cone)); // vertices
+      open.insert(body[cone[0] - begin]);
+    }
+  }
+  for (;;) {
+    PetscInt next;
+    PetscReal sums[5] = {0, 0, 0, 0, 0}; // coordinates and number of the body's vertices, ranks where it is open
+    PetscCall(next_body(comm, body, last, next));
+    if (next == PETSC_MAX_INT) break;
+    sums[4] = static_cast<PetscReal>(open.count(next));
+    for (PetscInt v = begin; v < end; ++v) {
+      PetscReal x[3];
+      if (body[v - begin] != next) continue;
+      PetscCall(node_coordinates(v, x));
+      for (int d = 0; d < 3; ++d) sums[d] += x[d];
+      ++sums[3];
+    }
+    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, sums, 5, MPIU_REAL, MPI_SUM, comm));
+    PulmoUserCheck(
+        sums[4] > 0, comm,
+        "the body around (%.6g, %.6g, %.6g) mm of mesh %s is joined to no facet that %s names, so that no air "
+        "gets in; name its opening, or join the bodies or remove this one in gmsh",
+        (double)(sums[0] / sums[3]), (double)(sums[1] / sums[3]), (double)(sums[2] / sums[3]), file_.c_str(),
+        option.c_str());
+    last = next;
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }

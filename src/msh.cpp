@@ -400,13 +400,13 @@ private:
   void element(long id, long type, long physical)
   {
     const auto [dimension, n] = shape(type);
-    std::array<int, 8> nodes;
+    std::array<int, 8> nodes{};
     for (int i = 0; i < n; ++i)
       nodes[i] = node_index(version_ == 41 ? in_.size("the node of an element") : in_.whole("the node of an element"));
-    std::array<int, 8> ordered = nodes;
-    std::sort(ordered.begin(), ordered.begin() + n);
-    if (std::adjacent_find(ordered.begin(), ordered.begin() + n) != ordered.begin() + n)
-      throw Fault{"has element " + std::to_string(id) + ", which uses a node twice; mesh anew"};
+    for (int i = 0; i < n; ++i)
+      for (int j = 0; j < i; ++j)
+        if (nodes[i] == nodes[j])
+          throw Fault{"has element " + std::to_string(id) + ", which uses a node twice; mesh anew"};
     if (type == 4) {
       cells_.push_back({nodes[0], nodes[1], nodes[2], nodes[3]});
       for (int i = 0; i < 4; ++i) in_cell_[nodes[i]] = 1;
