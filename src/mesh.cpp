@@ -234,7 +234,8 @@ PetscErrorCode Mesh::declare(Options &options)
   PetscFunctionBeginUser;
   options.group("mesh", "mesh (read from -dm_plex_filename)");
   PetscCall(options.given("scale", scale_given_));
-  PetscCall(options.real("scale", "-", Range::positive(), "multiplies the coordinates read, to get mm", scale_));
+  PetscCall(
+      options.real("scale", "-", Range::between(1e-9, 1e9), "multiplies the coordinates read, to get mm", scale_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

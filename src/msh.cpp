@@ -11,6 +11,7 @@
 #include <map>
 #include <numeric>
 #include <optional>
+#include <set>
 #include <string_view>
 #include <vector>
 
@@ -215,6 +216,7 @@ private:
 
   void names()
   {
+    std::set<std::pair<long, long>> named; // dimension and tag of a group
     for (long i = in_.count(in_.written<long>("the number of names"), "names"); i > 0; --i) {
       const long dimension = in_.written<long>("the dimension of a name"), tag = in_.written<long>("the tag of a name");
       const std::string_view line = in_.rest_of_line();
@@ -228,6 +230,7 @@ private:
         in_.unreadable("a physical name has 1 to 120 letters without quotes and colons");
       if (is_petsc_label(name))
         throw Fault{"names a group '" + name + "', which PETSc keeps for itself; give it another name"};
+      if (!named.insert({dimension, tag}).second) in_.unreadable("two names for one group");
       if (dimension == 2) surface_names_[tag] = name;
     }
     close("$EndPhysicalNames");

@@ -35,21 +35,19 @@ std::string join(const std::vector<std::string> &parts, const char *separator)
   return s;
 }
 
-/// Levenshtein distance.
+/// How many letters must be added, left out, changed or swapped with their neighbour to make @p b of @p a.
 std::size_t distance(const std::string &a, const std::string &b)
 {
-  std::vector<std::size_t> row(b.size() + 1);
-  for (std::size_t j = 0; j <= b.size(); ++j) row[j] = j;
-  for (std::size_t i = 1; i <= a.size(); ++i) {
-    std::size_t diagonal = row[0];
-    row[0] = i;
-    for (std::size_t j = 1; j <= b.size(); ++j) {
-      const std::size_t change = diagonal + (a[i - 1] != b[j - 1]);
-      diagonal = row[j];
-      row[j] = std::min({row[j] + 1, row[j - 1] + 1, change});
+  std::vector<std::vector<std::size_t>> d(a.size() + 1, std::vector<std::size_t>(b.size() + 1));
+  for (std::size_t i = 0; i <= a.size(); ++i)
+    for (std::size_t j = 0; j <= b.size(); ++j) {
+      d[i][j] = std::max(i, j);
+      if (i == 0 || j == 0) continue;
+      d[i][j] = std::min({d[i - 1][j] + 1, d[i][j - 1] + 1, d[i - 1][j - 1] + (a[i - 1] != b[j - 1])});
+      if (i > 1 && j > 1 && a[i - 1] == b[j - 2] && a[i - 2] == b[j - 1])
+        d[i][j] = std::min(d[i][j], d[i - 2][j - 2] + 1);
     }
-  }
-  return row[b.size()];
+  return d[a.size()][b.size()];
 }
 
 /// What the value of a flag says, in any case; empty if it says neither.
@@ -382,7 +380,7 @@ PetscErrorCode Options::warn_unused() const
     // solver files serve scenes of one and of two fields; -options_left is PETSc's own
     if (begins("-options_left") || begins("-pc_fieldsplit_") || begins("-fieldsplit_")) continue;
     PetscCall(PetscPrintf(comm_, "pulmo: warning: option %s was not used%s\n", name.c_str(),
-                          guess.empty() ? "" : ("; did you mean " + guess + "?").c_str()));
+                          guess.empty() || guess == name ? "" : ("; did you mean " + guess + "?").c_str()));
   }
   PetscCall(PetscOptionsLeftRestore(nullptr, &n, &names, &values));
   PetscFunctionReturn(PETSC_SUCCESS);

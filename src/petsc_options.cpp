@@ -1,6 +1,7 @@
 // Values of PETSc's own options, looked at before PETSc reads them.
 #include "pulmo/options.hpp"
 
+#include <algorithm>
 #include <cmath>
 
 namespace pulmo {
@@ -94,16 +95,30 @@ PetscErrorCode Options::check_petsc() const
   std::vector<std::pair<std::string, std::string>> given;
 
   PetscFunctionBeginUser;
-  PetscCall(TSInitializePackage()); // and with it those of SNES, KSP, PC and Mat
+  PetscCall(TSInitializePackage());
+  PetscCall(SNESInitializePackage());
+  PetscCall(KSPInitializePackage());
+  PetscCall(PCInitializePackage());
+  PetscCall(MatInitializePackage());
   const Types types[] = {{"pc_type", PCList}, {"ksp_type", KSPList}, {"snes_type", SNESList}, {"ts_type", TSList}};
   PetscCall(all_given(given));
   for (const auto &[option, value] : given) {
+    const std::string &name = option;
+    const auto is_own = [&](const Declared &d) { return d.name == name; };
+    if (std::any_of(declared_.begin(), declared_.end(), is_own)) continue;
+    for (const char *no_number : {"nan", "-nan", "inf", "-inf"}) {
+      PetscBool same;
+      PetscCall(PetscStrcasecmp(value.c_str(), no_number, &same));
+      PulmoUserCheck(!same, comm_, "option %s takes a finite number, not '%s'", option.c_str(), value.c_str());
+    }
     for (const Number &number : numbers()) {
       double parsed;
       if (option != number.name) continue;
       PetscCall(parse_number(option, value, number.unit, number.range, parsed));
       PulmoUserCheck(!number.whole || parsed == std::floor(parsed), comm_, "option %s takes a whole number, not '%s'",
                      option.c_str(), value.c_str());
+      PulmoUserCheck(parsed != 0 || number.range.low >= 0, comm_,
+                     "option %s 0 is out of range; take 1 or more, or -1 or -2 for once", option.c_str());
     }
     for (const Types &type : types) {
       void (*found)(void) = nullptr;
