@@ -74,7 +74,7 @@ std::string file_fault(const std::string &file, std::vector<std::string> &asking
     return named + " asks for itself" + (asking.back() == file ? "" : " through " + asking.back()) +
            "; remove that line";
   if (is_yaml(file)) return "";
-  if (!std::filesystem::is_directory(file, error)) in.open(file);
+  if (std::filesystem::is_regular_file(file, error)) in.open(file); // what flows through a pipe is gone after a look
   if (!in.is_open()) return named + " cannot be read; check its name";
   asking.push_back(file);
   std::vector<std::string> words;

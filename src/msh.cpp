@@ -61,8 +61,10 @@ public:
     return found;
   }
 
+  /// What follows the last word on its line.
   std::string_view rest_of_line()
   {
+    if (at_ > begin_ && at_[-1] == '\n') return {};
     const char *from = at_;
     at_ = std::find(at_, end_, '\n');
     const std::string_view found(from, static_cast<std::size_t>(at_ - from));
@@ -221,12 +223,12 @@ private:
       const long dimension = in_.written<long>("the dimension of a name"), tag = in_.written<long>("the tag of a name");
       const std::string_view line = in_.rest_of_line();
       const auto first = line.find('"'), last = line.rfind('"');
-      if (first == last || dimension < 0 || dimension > 3 || std::abs(tag) > INT_MAX)
-        in_.unreadable("no name in quotes, or no dimension from 0 to 3");
+      if (first == last || line.find_first_not_of(" \t") != first || line.find_last_not_of(" \t\r") != last ||
+          dimension < 0 || dimension > 3 || std::abs(tag) > INT_MAX)
+        in_.unreadable("no line of a dimension from 0 to 3, a tag and a name in quotes");
       const std::string name(line.substr(first + 1, last - first - 1));
       const auto odd = [](unsigned char c) { return c < 32 || c == '"' || c == ':' || c == 127; };
-      if (name.empty() || name.size() > longest_name || std::any_of(name.begin(), name.end(), odd) ||
-          line.find(':') != std::string_view::npos)
+      if (name.empty() || name.size() > longest_name || std::any_of(name.begin(), name.end(), odd))
         in_.unreadable("a physical name has 1 to 120 letters without quotes and colons");
       if (is_petsc_label(name))
         throw Fault{"names a group '" + name + "', which PETSc keeps for itself; give it another name"};
