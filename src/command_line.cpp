@@ -36,8 +36,8 @@ bool split(const std::string &line, std::vector<std::string> &words)
   words.clear();
   for (std::size_t at = line.find_first_not_of(space); at != std::string::npos;
        at = line.find_first_not_of(space, at)) {
-    const bool quoted = line[at] == '"' || line[at] == '\'';
-    const std::size_t end = quoted ? line.find(line[at], at + 1) : line.find_first_of(space, at);
+    const bool quoted = line[at] == '"';
+    const std::size_t end = quoted ? line.find('"', at + 1) : line.find_first_of(space, at);
     if (quoted && end == std::string::npos) return false;
     words.push_back(line.substr(at + quoted, end - at - quoted));
     if (end == std::string::npos) break;

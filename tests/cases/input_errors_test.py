@@ -478,7 +478,7 @@ def table(m):
                                   ["two.opts: line 2", "-airflow and -chest_wall", "a line of its own"]),
         "two values on a line": (options_of("values.opts", b"-chest_wall_surfaces pleura, airway\n"),
                                  ["values.opts: line 1", "'airway'", "-chest_wall_surfaces"]),
-        "an open quote": (options_of("quote.opts", b"-output_dir 'here\n"), ["quote.opts: line 1", "quote"]),
+        "an open quote": (options_of("quote.opts", b'-output_dir "here\n'), ["quote.opts: line 1", "quote"]),
         "a misspelt option in a file": (options_of("slip.opts", b"-chest_wall_stifness 0.1\n"),
                                         ["-chest_wall_stifness", "did you mean -chest_wall_stiffness?"]),
         "an option out of range in a file": (options_of("range.opts", b"-airflow_porosity 99\n"),

@@ -240,7 +240,8 @@ TEST(Fuzz, OptionFiles)
   int passed = 0;
   const int n = rounds(600);
   for (const char *file : {"petsc_options/scenes/pcv.opts", "petsc_options/solvers/iterative.opts"}) {
-    const std::string seed = content_of(source(file)) + "-airflow_surfaces 'airway'\n\talias -short -long_name # new\n";
+    const std::string seed =
+        content_of(source(file)) + "-airflow_surfaces \"airway rim\"\n\talias -short -long_name # new\n";
     for (int i = 0; i < n; ++i) {
       const std::string text = mutation.of(seed);
       const std::string &path = scratch.write(text);
@@ -253,7 +254,8 @@ TEST(Fuzz, OptionFiles)
       PetscOptions options;
       PULMO_OK(PetscOptionsCreate(&options));
       EXPECT_TRUE(
-          taken([&] { return PetscOptionsInsertFile(PETSC_COMM_WORLD, options, path.c_str(), PETSC_TRUE); }, text));
+          taken([&] { return PetscOptionsInsertFile(PETSC_COMM_WORLD, options, path.c_str(), PETSC_TRUE); }, text))
+          << text;
       PULMO_OK(PetscOptionsDestroy(&options));
     }
   }
