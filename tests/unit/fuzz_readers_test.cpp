@@ -67,7 +67,7 @@ private:
   {
     static const char *const numbers[] = {
         "0",   "-1",  "1", "2147483647", "-2147483648", "4294967296", "44", "1e308", "-1e-308", "9223372036854775808",
-        "nan", "inf", "3", "0x10",       "1e400",       "1000000",    "",   "15"};
+        "nan", "inf", "3", "0x10",       "1e400",       "100000",     "",   "15"};
     const std::size_t at = below(text.size());
     std::size_t from, to;
     switch (below(8)) {
