@@ -1,13 +1,14 @@
 #include "pulmo/mesh.hpp"
 
+#include "pulmo/msh.hpp"
 #include "pulmo/units.hpp"
 
 #include <algorithm>
-#include <array>
 #include <cmath>
-#include <cstdio>
+#include <filesystem>
+#include <fstream>
 #include <iterator>
-#include <numeric>
+#include <sstream>
 
 namespace pulmo {
 
@@ -42,39 +43,56 @@ PetscErrorCode has_curved_cells(DM dm, bool &curved)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-/// Reads the file on rank 0 alone so that an unreadable mesh is one clear error on all ranks.
-PetscErrorCode check_file(MPI_Comm comm, const std::string &file)
+/// Whether PETSc takes a file of this name for gmsh's.
+bool is_msh(const std::string &file)
 {
-  PetscMPIInt rank;
-  int found = 1, readable = 1;
+  const std::string extension = std::filesystem::path(file).extension();
+  return extension == ".msh" || extension == ".msh2" || extension == ".msh4";
+}
+
+/// Reads the file on this rank; @p fault tells what is wrong with it (msh_fault()), or is empty.
+PetscErrorCode find_fault(const std::string &file, std::string &fault)
+{
+  std::error_code error;
+  std::ifstream in;
+  DMHandle trial;
   bool curved = false;
 
   PetscFunctionBeginUser;
-  PetscCallMPI(MPI_Comm_rank(comm, &rank));
-  if (rank == 0) {
-    std::FILE *f = std::fopen(file.c_str(), "rb");
-    found = f != nullptr;
-    if (f) {
-      DMHandle trial;
-      char first = 0;
-      found = std::fread(&first, 1, 1, f) == 1;
-      std::fclose(f);
-      PetscCall(PetscPushErrorHandler(PetscReturnErrorHandler, nullptr));
-      readable = found && DMPlexCreateFromFile(PETSC_COMM_SELF, file.c_str(), "pulmo", PETSC_FALSE, trial.out()) == 0;
-      PetscCall(PetscPopErrorHandler());
-      if (readable) PetscCall(has_curved_cells(trial, curved));
-    }
+  if (std::filesystem::is_regular_file(file, error)) in.open(file, std::ios::binary);
+  if (!in.is_open() || in.peek() == std::ifstream::traits_type::eof()) {
+    fault = "cannot be read: there is no such file, or it is empty; check its name";
+  } else if (is_msh(file)) {
+    std::ostringstream content;
+    content << in.rdbuf();
+    fault = msh_fault(content.str());
+  } else { // another format of PETSc's
+    PetscCall(PetscPushErrorHandler(PetscReturnErrorHandler, nullptr));
+    const bool readable = DMPlexCreateFromFile(PETSC_COMM_SELF, file.c_str(), "pulmo", PETSC_FALSE, trial.out()) == 0;
+    PetscCall(PetscPopErrorHandler());
+    if (readable) PetscCall(has_curved_cells(trial, curved));
+    if (!readable)
+      fault = "is not a readable mesh; pulmo reads gmsh's MSH 2.2 and 4.1 (ASCII or binary), in files that end in .msh";
+    else if (curved)
+      fault = "holds elements of higher order; save it with straight ones";
   }
-  PetscCallMPI(MPI_Bcast(&found, 1, MPI_INT, 0, comm));
-  PetscCallMPI(MPI_Bcast(&readable, 1, MPI_INT, 0, comm));
-  PetscCallMPI(MPI_Bcast(&curved, 1, MPI_CXX_BOOL, 0, comm));
-  PulmoUserCheck(found, comm, "-dm_plex_filename %s: there is no such file, or it is empty", file.c_str());
-  PulmoUserCheck(readable, comm,
-                 "-dm_plex_filename %s is not a readable mesh; pulmo reads gmsh's MSH 2.2 and 4.1 (ASCII or binary)",
-                 file.c_str());
-  PulmoUserCheck(!curved, comm,
-                 "-dm_plex_filename %s holds elements of higher order; save it with straight ones (gmsh -order 1)",
-                 file.c_str());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Looks at the file on rank 0 alone so that an unreadable mesh is one clear error on all ranks.
+PetscErrorCode check_file(MPI_Comm comm, const std::string &file)
+{
+  PetscMPIInt rank;
+  std::string fault;
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  if (rank == 0) PetscCall(find_fault(file, fault));
+  auto length = static_cast<int>(fault.size());
+  PetscCallMPI(MPI_Bcast(&length, 1, MPI_INT, 0, comm));
+  fault.resize(static_cast<std::size_t>(length));
+  PetscCallMPI(MPI_Bcast(fault.data(), length, MPI_CHAR, 0, comm));
+  PulmoUserCheck(fault.empty(), comm, "-dm_plex_filename %s %s", file.c_str(), fault.c_str());
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -115,104 +133,6 @@ PetscErrorCode find_shared_points(DM dm, PetscInt point_end, std::vector<char> &
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-/// body[vertex - begin]: a number that all vertices of one connected body share, on all ranks.
-PetscErrorCode find_bodies(DM dm, PetscInt begin, PetscInt end, std::vector<PetscInt> &body)
-{
-  const MPI_Comm comm = PetscObjectComm((PetscObject)dm);
-  PetscInt cell_begin, cell_end, point_end, roots, changed = 1;
-  PetscSF sf;
-  IS numbering;
-  const PetscInt *numbers;
-
-  PetscFunctionBeginUser;
-  PetscCall(DMPlexGetChart(dm, nullptr, &point_end));
-  PetscCall(DMPlexGetHeightStratum(dm, 0, &cell_begin, &cell_end));
-  PetscCall(DMPlexGetVertexNumbering(dm, &numbering));
-  PetscCall(ISGetIndices(numbering, &numbers));
-  std::vector<PetscInt> of(static_cast<std::size_t>(point_end), PETSC_MAX_INT), sent;
-  for (PetscInt v = begin; v < end; ++v)
-    of[v] = numbers[v - begin] < 0 ? -(numbers[v - begin] + 1) : numbers[v - begin];
-  PetscCall(ISRestoreIndices(numbering, &numbers));
-
-  // vertices joined by cells of this rank: a tree for each body, known by its root
-  std::vector<PetscInt> parent(static_cast<std::size_t>(point_end));
-  std::iota(parent.begin(), parent.end(), 0);
-  const auto root = [&](PetscInt v) {
-    while (parent[v] != v) v = parent[v] = parent[parent[v]];
-    return v;
-  };
-  for (PetscInt c = cell_begin; c < cell_end; ++c) {
-    PetscInt *closure = nullptr, n;
-    PetscCall(DMPlexGetTransitiveClosure(dm, c, PETSC_TRUE, &n, &closure));
-    const PetscInt joined = root(closure[2 * (n - 1)]); // vertices come last
-    for (PetscInt i = 0; i < n; ++i)
-      if (closure[2 * i] >= begin && closure[2 * i] < end) parent[root(closure[2 * i])] = joined;
-    PetscCall(DMPlexRestoreTransitiveClosure(dm, c, PETSC_TRUE, &n, &closure));
-  }
-
-  PetscCall(DMGetPointSF(dm, &sf));
-  PetscCall(PetscSFGetGraph(sf, &roots, nullptr, nullptr, nullptr));
-  while (changed) { // the least number spreads over each body, then over ranks
-    changed = 0;
-    for (PetscInt v = begin; v < end; ++v) {
-      PetscInt &least = of[root(v)];
-      if (of[v] < least) changed = 1;
-      least = std::min(least, of[v]);
-    }
-    for (PetscInt v = begin; v < end; ++v) {
-      if (of[v] != of[root(v)]) changed = 1;
-      of[v] = of[root(v)];
-    }
-    if (roots >= 0) {
-      sent = of;
-      PetscCall(PetscSFReduceBegin(sf, MPIU_INT, sent.data(), of.data(), MPI_MIN));
-      PetscCall(PetscSFReduceEnd(sf, MPIU_INT, sent.data(), of.data(), MPI_MIN));
-      sent = of;
-      PetscCall(PetscSFBcastBegin(sf, MPIU_INT, sent.data(), of.data(), MPI_REPLACE));
-      PetscCall(PetscSFBcastEnd(sf, MPIU_INT, sent.data(), of.data(), MPI_REPLACE));
-    }
-    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &changed, 1, MPIU_INT, MPI_MAX, comm));
-  }
-  body.assign(of.begin() + begin, of.begin() + end);
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-/// The least number of a body above @p last, over all ranks; PETSC_MAX_INT after the last.
-PetscErrorCode next_body(MPI_Comm comm, const std::vector<PetscInt> &body, PetscInt last, PetscInt &next)
-{
-  PetscFunctionBeginUser;
-  next = PETSC_MAX_INT;
-  for (PetscInt number : body)
-    if (number > last) next = std::min(next, number);
-  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &next, 1, MPIU_INT, MPI_MIN, comm));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-/// Labels that are not physical names of the mesh.
-bool own_label(const std::string &name)
-{
-  const std::string own[] = {"celltype", "depth", "ghost", "marker", "Cell Sets", "Face Sets", "vtk"};
-  return std::find(std::begin(own), std::end(own), name) != std::end(own);
-}
-
-/// Mesh points in [begin, end) that a label marks, in order.
-PetscErrorCode labelled_points(DM dm, const char *name, PetscInt begin, PetscInt end, std::vector<PetscInt> &points)
-{
-  DMLabel label;
-  PetscInt none;
-
-  PetscFunctionBeginUser;
-  points.clear();
-  PetscCall(DMGetLabel(dm, name, &label));
-  PetscCall(DMLabelGetDefaultValue(label, &none));
-  for (PetscInt p = begin; p < end; ++p) {
-    PetscInt value;
-    PetscCall(DMLabelGetValue(label, p, &value));
-    if (value != none) points.push_back(p);
-  }
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
 } // namespace
 
 PetscErrorCode Mesh::declare(Options &options)
@@ -220,7 +140,8 @@ PetscErrorCode Mesh::declare(Options &options)
   PetscFunctionBeginUser;
   options.group("mesh", "mesh (read from -dm_plex_filename)");
   PetscCall(options.given("scale", scale_given_));
-  PetscCall(options.real("scale", "-", Range::positive(), "multiplies the coordinates read, to get mm", scale_));
+  PetscCall(
+      options.real("scale", "-", Range::between(1e-9, 1e9), "multiplies the coordinates read, to get mm", scale_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -240,6 +161,7 @@ PetscErrorCode Mesh::read(const Options &options, bool ventilated)
 
   // one label per physical name
   PetscCall(PetscOptionsSetValue(nullptr, "-dm_plex_gmsh_use_regions", "true"));
+  PetscCall(PetscOptionsSetValue(nullptr, "-dm_plex_gmsh_periodic", "false")); // a lung is not periodic
   // cells that are neighbours in space become neighbours in memory: mesh generators number them at random, and then
   // assembly, products and smoothers mostly wait for memory
   PetscCall(PetscOptionsHasName(nullptr, nullptr, "-dm_plex_reorder", &given));
@@ -357,7 +279,7 @@ PetscErrorCode Mesh::find_surfaces(const Options &options)
     PetscReal area = 0;
 
     PetscCall(DMGetLabelName(dm_, l, &name));
-    if (own_label(name)) continue;
+    if (is_petsc_label(name)) continue;
     PetscCall(DMGetLabel(dm_, name, &label));
     PetscCall(DMLabelGetValueIS(label, values_is.out()));
     PetscCall(ISGetLocalSize(values_is, &n_values));
@@ -467,165 +389,6 @@ PetscErrorCode node_coordinates(DM dm, PetscInt point, PetscReal x[3])
     PetscInt offset;
     PetscCall(PetscSectionGetOffset(section, ends[i], &offset));
     for (int d = 0; d < 3; ++d) x[d] += values[offset + d] / n;
-  }
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode Mesh::regions(std::vector<Region> &list) const
-{
-  const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
-  PetscInt vertex_begin, vertex_end, begin, end, n_labels, last = -1;
-  std::vector<PetscInt> body_of, cell_body;
-  struct Body {
-    Region region;
-    PetscReal centroid[3];
-  };
-  std::vector<Body> bodies;
-
-  PetscFunctionBeginUser;
-  PetscCall(DMPlexGetDepthStratum(dm_, 0, &vertex_begin, &vertex_end));
-  PetscCall(DMPlexGetHeightStratum(dm_, 0, &begin, &end));
-  PetscCall(find_bodies(dm_, vertex_begin, vertex_end, body_of));
-  for (PetscInt c = begin; c < end; ++c) {
-    const PetscInt *cone = &c; // a face, an edge, a vertex of the cell
-    for (int depth = 0; depth < 3; ++depth) PetscCall(DMPlexGetCone(dm_, cone[0], &cone));
-    cell_body.push_back(body_of[cone[0] - vertex_begin]);
-  }
-  for (;;) {
-    PetscInt next;
-    PetscReal moments[4] = {0, 0, 0, 0};
-    Body body;
-    PetscCall(next_body(comm, body_of, last, next));
-    if (next == PETSC_MAX_INT) break;
-    for (PetscInt c = 0; c < end - begin; ++c) {
-      PetscReal volume, centre[3];
-      if (cell_body[c] != next) continue;
-      body.region.cells.push_back(c);
-      PetscCall(DMPlexComputeCellGeometryFVM(dm_, begin + c, &volume, centre, nullptr));
-      moments[3] += volume;
-      for (int d = 0; d < 3; ++d) moments[d] += volume * centre[d];
-    }
-    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, moments, 4, MPIU_REAL, MPI_SUM, comm));
-    for (int d = 0; d < 3; ++d) body.centroid[d] = moments[d] / moments[3];
-    body.region.body = true;
-    bodies.push_back(body);
-    last = next;
-  }
-  // the numbers of the bodies depend on how the mesh is distributed, their places do not
-  const PetscReal rounding = 1e-6 * length_;
-  std::sort(bodies.begin(), bodies.end(), [rounding](const Body &a, const Body &b) {
-    for (int d = 0; d < 3; ++d)
-      if (std::abs(a.centroid[d] - b.centroid[d]) > rounding) return a.centroid[d] < b.centroid[d];
-    return false;
-  });
-
-  list.clear();
-  PetscCall(DMGetNumLabels(dm_, &n_labels));
-  for (PetscInt l = 0; l < n_labels; ++l) {
-    const char *name;
-    Region region;
-    PetscCall(DMGetLabelName(dm_, l, &name));
-    if (own_label(name)) continue;
-    PetscCall(labelled_points(dm_, name, begin, end, region.cells));
-    auto found = static_cast<PetscInt>(region.cells.size());
-    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &found, 1, MPIU_INT, MPI_SUM, comm));
-    if (found == 0) continue;
-    region.name = name;
-    for (PetscInt &c : region.cells) c -= begin;
-    for (Body &body : bodies) {
-      int same = body.region.cells == region.cells;
-      PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &same, 1, MPI_INT, MPI_LAND, comm));
-      if (!same || !body.region.name.empty()) continue;
-      region.body = true;
-      body.region.name = name;
-    }
-    list.push_back(region);
-  }
-  std::sort(list.begin(), list.end(), [](const Region &a, const Region &b) { return a.name < b.name; });
-  int unnamed = 0;
-  for (Body &body : bodies) {
-    if (!body.region.name.empty()) continue;
-    body.region.name = "body_" + std::to_string(++unnamed);
-    list.push_back(body.region);
-  }
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode Mesh::rigid_pins(std::vector<Pin> &pins) const
-{
-  const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
-  PetscInt begin, end, last = -1;
-  std::vector<PetscInt> body;
-
-  PetscFunctionBeginUser;
-  PetscCall(DMPlexGetDepthStratum(dm_, 0, &begin, &end));
-  PetscCall(find_bodies(dm_, begin, end, body));
-  pins.clear();
-  for (;;) { // bodies in the order of their numbers
-    PetscInt next;
-    std::vector<PetscInt> vertices;
-    PetscCall(next_body(comm, body, last, next));
-    if (next == PETSC_MAX_INT) break;
-    for (PetscInt v = begin; v < end; ++v)
-      if (body[v - begin] == next) vertices.push_back(v);
-    PetscCall(pin_body(vertices, pins));
-    last = next;
-  }
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode Mesh::pin_body(const std::vector<PetscInt> &vertices, std::vector<Pin> &pins) const
-{
-  using Coordinates = std::array<PetscReal, 3>;
-  constexpr PetscReal off_axis = 3; // weight of what leads away from an axis
-  const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
-  PetscMPIInt size;
-  std::array<Coordinates, 3> chosen{};
-  int along = 2, across = 0; // the axis that AB is close to; the second axis of the plane that ABC is close to
-
-  PetscFunctionBeginUser;
-  PetscCallMPI(MPI_Comm_size(comm, &size));
-  // A: the lowest vertex. B: far from A and close to an axis through A. C: far from AB and close to a plane of two
-  // axes through it. Then the held components hardly turn a lung that swells. Ranks that share a vertex have the same
-  // coordinates for it, so the choice by coordinates is the same on all.
-  const auto score = [&](int k, const Coordinates &x, int axis) {
-    Coordinates d;
-    for (int i = 0; i < 3; ++i) d[i] = std::abs(x[i] - chosen[0][i]);
-    if (k == 0) return -x[2];
-    const int next = (axis + 1) % 3, last = (axis + 2) % 3;
-    if (k == 1) return d[axis] - off_axis * (d[next] + d[last]);
-    return axis == along ? -PETSC_MAX_REAL : d[axis] - off_axis * d[3 - along - axis];
-  };
-  for (int k = 0; k < 3; ++k) {
-    // score, then (ties must not depend on how the mesh is numbered and distributed) coordinates and axis, negative
-    using Candidate = std::array<double, 5>;
-    Candidate best{-PETSC_MAX_REAL, 0, 0, 0, 0};
-    for (PetscInt v : vertices) {
-      Coordinates x;
-      PetscCall(node_coordinates(v, x.data()));
-      for (int axis = 0; axis < 3; ++axis)
-        best = std::max(best, Candidate{score(k, x, axis), -x[0], -x[1], -x[2], -(double)axis});
-    }
-    std::vector<Candidate> all(size);
-    PetscCallMPI(MPI_Allgather(best.data(), 5, MPI_DOUBLE, all.data(), 5, MPI_DOUBLE, comm));
-    best = *std::max_element(all.begin(), all.end());
-    for (int d = 0; d < 3; ++d) chosen[k][d] = -best[1 + d];
-    const int axis = static_cast<int>(-best[4]);
-    if (k == 1) along = axis;
-    if (k == 2) across = axis;
-  }
-  for (int k = 0; k < 3; ++k) {
-    Pin pin;
-    for (int d = 0; d < 3; ++d) {
-      pin.x[d] = chosen[k][d];
-      pin.component[d] = k == 0 || (k == 1 && d != along) || (k == 2 && d == 3 - along - across);
-    }
-    for (PetscInt v : vertices) {
-      Coordinates x;
-      PetscCall(node_coordinates(v, x.data()));
-      if (x == chosen[k]) pin.vertex = v;
-    }
-    pins.push_back(pin);
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }

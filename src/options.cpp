@@ -35,21 +35,19 @@ std::string join(const std::vector<std::string> &parts, const char *separator)
   return s;
 }
 
-/// Levenshtein distance.
+/// How many letters must be added, left out, changed or swapped with their neighbour to make @p b of @p a.
 std::size_t distance(const std::string &a, const std::string &b)
 {
-  std::vector<std::size_t> row(b.size() + 1);
-  for (std::size_t j = 0; j <= b.size(); ++j) row[j] = j;
-  for (std::size_t i = 1; i <= a.size(); ++i) {
-    std::size_t diagonal = row[0];
-    row[0] = i;
-    for (std::size_t j = 1; j <= b.size(); ++j) {
-      const std::size_t change = diagonal + (a[i - 1] != b[j - 1]);
-      diagonal = row[j];
-      row[j] = std::min({row[j] + 1, row[j - 1] + 1, change});
+  std::vector<std::vector<std::size_t>> d(a.size() + 1, std::vector<std::size_t>(b.size() + 1));
+  for (std::size_t i = 0; i <= a.size(); ++i)
+    for (std::size_t j = 0; j <= b.size(); ++j) {
+      d[i][j] = std::max(i, j);
+      if (i == 0 || j == 0) continue;
+      d[i][j] = std::min({d[i - 1][j] + 1, d[i][j - 1] + 1, d[i - 1][j - 1] + (a[i - 1] != b[j - 1])});
+      if (i > 1 && j > 1 && a[i - 1] == b[j - 2] && a[i - 2] == b[j - 1])
+        d[i][j] = std::min(d[i][j], d[i - 2][j - 2] + 1);
     }
-  }
-  return row[b.size()];
+  return d[a.size()][b.size()];
 }
 
 /// What the value of a flag says, in any case; empty if it says neither.
@@ -258,18 +256,41 @@ PetscErrorCode Options::vector(const std::string &name, const std::string &unit,
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-std::string Options::nearest(const std::string &name) const
+std::string Options::nearest(const std::string &name, std::size_t most) const
 {
   std::string best;
-  std::size_t least = name.size() / 3 + 2;
-  for (const Declared &d : declared_) {
-    const std::size_t away = distance(d.name, name);
+  std::size_t least = most + 1;
+  const auto try_name = [&](const std::string &known) {
+    const std::size_t away = distance(known, name);
     if (away < least) {
       least = away;
-      best = d.name;
+      best = known;
     }
-  }
+  };
+  for (const Declared &d : declared_) try_name(d.name);
+  for (const std::string &known : petsc_names()) try_name(known);
   return best;
+}
+
+/// The option that @p name, which nothing declared, must be meant for; empty if it may be one of PETSc's.
+std::string Options::misspelt(const std::string &name) const
+{
+  if (name.compare(0, 2, "--") == 0) return name.substr(1);
+  // PETSc has thousands of names, some a letter away from one another: only those that make a scene are guarded
+  static constexpr const char *essential[] = {"-dm_plex_filename", "-options_file", "-pc_type", "-ts_dt",
+                                              "-ts_max_time"};
+  constexpr std::size_t letters_per_slip = 4;
+  const std::string guess = nearest(name, std::min<std::size_t>(2, (name.size() - 1) / letters_per_slip));
+  const auto same = [&](const Declared &d) { return d.name == guess; };
+  if (std::any_of(declared_.begin(), declared_.end(), same) ||
+      (guess != name && std::find(std::begin(essential), std::end(essential), guess) != std::end(essential)))
+    return guess;
+  const std::string tail = "_" + name.substr(1); // -pip for -ventilator_pip
+  for (const Declared &d : declared_)
+    if (tail.size() > 3 && d.name.size() > tail.size() &&
+        d.name.compare(d.name.size() - tail.size(), tail.size(), tail) == 0)
+      return d.name;
+  return "";
 }
 
 PetscErrorCode Options::all_given(std::vector<std::pair<std::string, std::string>> &list) const
@@ -281,9 +302,10 @@ PetscErrorCode Options::all_given(std::vector<std::pair<std::string, std::string
   PetscCall(PetscOptionsGetAll(nullptr, &all));
   std::istringstream stream(all);
   PetscCall(PetscFree(all));
-  // the database prints "-name value -name value ..."; a value never begins with '-' and a letter
+  // the database prints "-name value -name value ..."; a value never begins with '-' and a letter or another '-'
   for (std::string word; stream >> word;) {
-    const bool is_name = word.size() > 1 && word[0] == '-' && std::isalpha(static_cast<unsigned char>(word[1]));
+    const bool is_name =
+        word.size() > 1 && word[0] == '-' && (word[1] == '-' || std::isalpha(static_cast<unsigned char>(word[1])));
     if (is_name)
       list.emplace_back(word, "");
     else if (!list.empty())
@@ -352,10 +374,13 @@ PetscErrorCode Options::check_unknown() const
       const bool ours = !group.name.empty() && name.compare(0, prefix.size(), prefix) == 0 &&
                         (name.size() == prefix.size() || name[prefix.size()] == '_');
       if (!ours) continue;
-      const std::string guess = nearest(name);
+      const std::string guess = nearest(name, name.size() / 3 + 1);
       PulmoUserError(comm_, "unknown option %s%s; pulmo -help lists all", name.c_str(),
                      guess.empty() ? "" : (": did you mean " + guess + "?").c_str());
     }
+    const std::string meant = misspelt(name);
+    PulmoUserCheck(meant.empty(), comm_, "unknown option %s: did you mean %s? pulmo -help lists all", name.c_str(),
+                   meant.c_str());
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -368,12 +393,12 @@ PetscErrorCode Options::warn_unused() const
   PetscFunctionBeginUser;
   PetscCall(PetscOptionsLeftGet(nullptr, &n, &names, &values));
   for (PetscInt i = 0; i < n; ++i) {
-    const std::string name = std::string("-") + names[i], guess = nearest(name);
+    const std::string name = std::string("-") + names[i], guess = nearest(name, name.size() / 3 + 1);
     const auto begins = [&](const char *prefix) { return name.rfind(prefix, 0) == 0; };
     // solver files serve scenes of one and of two fields; -options_left is PETSc's own
     if (begins("-options_left") || begins("-pc_fieldsplit_") || begins("-fieldsplit_")) continue;
     PetscCall(PetscPrintf(comm_, "pulmo: warning: option %s was not used%s\n", name.c_str(),
-                          guess.empty() ? "" : ("; did you mean " + guess + "?").c_str()));
+                          guess.empty() || guess == name ? "" : ("; did you mean " + guess + "?").c_str()));
   }
   PetscCall(PetscOptionsLeftRestore(nullptr, &n, &names, &values));
   PetscFunctionReturn(PETSC_SUCCESS);

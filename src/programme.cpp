@@ -15,6 +15,14 @@ namespace {
 constexpr std::size_t max_phases = 1000000;
 /// Shorter phases would be lost in the rounding of the clock, s.
 constexpr PetscReal least_duration = 1e-6;
+/// So would least_duration in a run that lasts longer, s.
+constexpr PetscReal longest_run = 1e7;
+/// No lung bears more, cmH2O or ml/s.
+constexpr PetscReal largest_value = 1e9;
+/// Repeats within repeats.
+constexpr int deepest_repeat = 100;
+/// Larger files are no programme, bytes.
+constexpr long largest_file = 16L << 20;
 
 PetscReal internal(Control control, PetscReal value)
 {
@@ -120,9 +128,13 @@ private:
       if (line.words[0] == "repeat") {
         std::size_t close = i;
         long times = 0;
+        PulmoUserCheck(++depth_ <= deepest_repeat, comm_,
+                       "%s:%d: more than %d 'repeat' within one another; write fewer", file_.c_str(), line.number,
+                       deepest_repeat);
         PetscCall(repeat(i, end, close, times));
         for (long k = 0; k < times; ++k) PetscCall(block(i + 1, close, line.number));
         i = close;
+        --depth_;
       } else {
         PulmoUserCheck(line.words[0] != "end", comm_, "%s:%d: 'end' closes no 'repeat'; remove it", file_.c_str(),
                        line.number);
@@ -211,6 +223,12 @@ private:
                    line.number, (double)ramp, (double)duration, w[0].c_str());
     PulmoUserCheck(!from || ramp > 0, comm_, "%s:%d: 'from' is the start of a ramp; give 'ramp' too", file_.c_str(),
                    line.number);
+    for (const PetscReal x : {value, from.value_or(0), limit.value_or(0)})
+      PulmoUserCheck(std::abs(x) <= largest_value, comm_, "%s:%d: %g is beyond what a ventilator gives; check the unit",
+                     file_.c_str(), line.number, (double)x);
+    time_ += duration;
+    PulmoUserCheck(time_ <= longest_run, comm_, "%s:%d: the phases last longer than %g s; shorten '%s'", file_.c_str(),
+                   line.number, (double)longest_run, w[0].c_str());
     if (w[0] == "inspiration") ++breath_;
     PulmoUserCheck(++phases_ <= max_phases, comm_, "%s:%d: more than %d phases; check the counts of 'repeat'",
                    file_.c_str(), line.number, (int)max_phases);
@@ -238,6 +256,8 @@ private:
   ProgrammeBuilder builder_;
   PetscInt breath_ = 0;
   std::size_t phases_ = 0;
+  PetscReal time_ = 0; // s, end of the last phase
+  int depth_ = 0;
 };
 
 } // namespace
@@ -261,14 +281,14 @@ PetscErrorCode read_programme(MPI_Comm comm, const std::string &option, const st
   PetscCallMPI(MPI_Comm_rank(comm, &rank));
   if (rank == 0) {
     std::ifstream in(file, std::ios::binary);
-    std::ostringstream all;
-    if (in && in.peek() != std::ifstream::traits_type::eof()) all << in.rdbuf();
-    text = all.str();
-    if (in && !in.bad()) size = static_cast<long>(text.size());
-    if (in.eof()) size = 0; // empty
+    text.resize(static_cast<std::size_t>(largest_file) + 1);
+    in.read(text.data(), static_cast<std::streamsize>(text.size()));
+    if (in.is_open() && !in.bad()) size = static_cast<long>(in.gcount());
   }
   PetscCallMPI(MPI_Bcast(&size, 1, MPI_LONG, 0, comm));
   PulmoUserCheck(size >= 0, comm, "cannot read %s (%s); check its name", file.c_str(), option.c_str());
+  PulmoUserCheck(size <= largest_file, comm, "%s (%s) has more than %ld MB: it is no programme; check its name",
+                 file.c_str(), option.c_str(), largest_file >> 20);
   text.resize(static_cast<std::size_t>(size));
   PetscCallMPI(MPI_Bcast(text.data(), static_cast<PetscMPIInt>(size), MPI_CHAR, 0, comm));
   PetscCall(parse_programme(comm, file, text, phases));

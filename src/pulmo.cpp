@@ -7,12 +7,15 @@ namespace pulmo {
 namespace {
 
 /// What a user is told of an error that PETSc found in an option's value; empty for every other error.
-std::string option_error(PetscErrorCode code, const std::string &message)
+std::string option_error(PetscErrorCode code, const std::string &message, const std::string &function)
 {
   const std::string first_line = message.substr(0, message.find('\n')), no_number = "Input string ";
   if (code == PETSC_ERR_ARG_UNKNOWN_TYPE) // -pc_type lemon
     return first_line + ": a PETSc option names a type that this PETSc does not have; check its spelling";
-  if (message.rfind(no_number, 0) != 0) return "";
+  if (message.rfind(no_number, 0) != 0) // -pc_fieldsplit_type lemon
+    return function.rfind("PetscOptions", 0) == 0
+               ? first_line + ": mend that option of PETSc's (-help lists its values)"
+               : "";
   // -ts_dt short: PETSc names the word only
   const std::string word = message.substr(no_number.size(), message.find(' ', no_number.size()) - no_number.size());
   std::vector<std::pair<std::string, std::string>> given;
@@ -29,7 +32,7 @@ PetscErrorCode handle_error(MPI_Comm comm, int line, const char *function, const
 {
   std::string text = message ? message : "";
   if (code != PETSC_ERR_USER_INPUT) {
-    text = type == PETSC_ERROR_INITIAL ? option_error(code, text) : "";
+    text = type == PETSC_ERROR_INITIAL ? option_error(code, text, function ? function : "") : "";
     if (text.empty()) return PetscTraceBackErrorHandler(comm, line, function, file, code, type, message, context);
   }
   if (type == PETSC_ERROR_INITIAL) {
@@ -117,6 +120,7 @@ PetscErrorCode Run::setup()
   PetscFunctionBeginUser;
   PetscCall(PetscTime(&start));
   PetscCall(options_.check_unknown());
+  PetscCall(options_.check_petsc());
   PetscCall(scene_.prepare(options_));
   Composition composition(scene_.mesh());
   PetscCall(scene_.compose(composition));

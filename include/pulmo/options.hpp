@@ -26,6 +26,9 @@ struct Range {
   std::string text() const;
 };
 
+/// Names of PETSc's options that a misspelt one may be meant for.
+const std::vector<std::string> &petsc_names();
+
 /// Declares and reads pulmo's own options from PETSc's database.
 ///
 /// Every function reads the option `-<group>_<name>` (or `-<group>` for an empty name) into @p value, whose
@@ -59,8 +62,12 @@ public:
 
   /// Ends with a user error if the database holds a name under one of pulmo's prefixes that nothing declared, or one
   /// of an effect that is not in use (unless that effect was turned off by `-<effect> off`).
+  /// So does a name outside these prefixes that is an option of pulmo's but for a letter or two, or for its prefix.
   PetscErrorCode check_unknown() const;
-  /// Warns of PETSc options that nobody read, with the nearest name that pulmo knows.
+  /// Ends with a user error if one of PETSc's options that scenes and solver files use has a value that PETSc would
+  /// take for something else, or would answer with a stack trace: numbers out of range, types that are not there.
+  PetscErrorCode check_petsc() const;
+  /// Warns of PETSc options that nobody read, with the nearest name that is known.
   PetscErrorCode warn_unused() const;
   /// Prints every declared option (the part of -help that is pulmo's own).
   PetscErrorCode print_help() const;
@@ -90,7 +97,10 @@ private:
   PetscErrorCode parse_number(const std::string &option, const std::string &raw, const std::string &unit,
                               const Range &range, double &value) const;
   std::string full(const std::string &name) const;
-  std::string nearest(const std::string &name) const;
+  /// The declared option, or PETSc's option that pulmo knows, whose name is nearest; empty if all are further away
+  /// than @p most letters.
+  std::string nearest(const std::string &name, std::size_t most) const;
+  std::string misspelt(const std::string &name) const;
 
   MPI_Comm comm_;
   std::vector<Group> groups_;

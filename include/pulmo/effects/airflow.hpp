@@ -152,6 +152,7 @@ public:
   {
     PetscFunctionBeginUser;
     PetscCall(mesh.require_surfaces(surfaces_, "-airflow_surfaces"));
+    PetscCall(mesh.require_openings(surfaces_, "-airflow_surfaces"));
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
