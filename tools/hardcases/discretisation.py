@@ -26,7 +26,6 @@ def column(mesh, sides, k, dt, end, solver=pulmo.TIGHT, load=LOAD):
                                       "-ts_dt", dt, "-ts_max_time", end]
 
 
-ATOL = ["-snes_atol", 1e-11]  # it is relative to the stiffest entry of the tangent, and bending is soft
 BOX_SIDES = ["y0", "y1", "z0", "z1"]
 COLUMN = (["-dm_plex_filename", pulmo.mesh("column.msh"), "-mesh_scale", 100], ["sides_y", "sides_z"])
 
@@ -96,11 +95,13 @@ def tight(lab):
         lab.below("k = 1e-6: rms error of p with -pressure_damping over that without", errors[-6, " damped"] / errors[-6, ""], 1)
         lab.below("its cost at k = 1e4: rms error of p/p0 with it", errors[4, " damped"], 1e-3)
         lab.demand("k = 1e4: rms error of p/p0 without", errors[4, ""], "for comparison", True)
-    breath = pulmo.DIRECT + pulmo.PCV + pulmo.LUNG + ["-ts_max_time", 0.2 if lab.small else 0.5]
-    plain, damped = lab.finished(breath, "breath"), lab.finished(breath + ["-pressure_damping"], "breath, damped")
-    if plain and damped:
-        a, b = plain.signals()["volume_ml"], damped.signals()["volume_ml"]
-        lab.below("its cost in a usual breath (k = 1e4): largest change of V over the largest V", np.abs(a - b).max() / a.max(), 0.01)
+    if not lab.small:
+        breath = pulmo.DIRECT + pulmo.PCV + pulmo.LUNG + ["-ts_max_time", 0.5]
+        plain, damped = lab.finished(breath, "breath"), lab.finished(breath + ["-pressure_damping"], "breath, damped")
+        if plain and damped:
+            a, b = plain.signals()["volume_ml"], damped.signals()["volume_ml"]
+            lab.below("its cost in a usual breath (k = 1e4, cells of 20 mm): largest change of V over the largest V",
+                      np.abs(a - b).max() / a.max(), 0.01)
     for name, scene, flags in (("pressure control", pulmo.PCV, []), ("volume control", pulmo.VCV, ["-ventilator_tidal_volume", 0.2])):
         for file in [pulmo.DIRECT] if lab.small else [pulmo.DIRECT, ITERATIVE]:
             run = lab.finished(file + scene + pulmo.LUNG + flags + ["-tissue", "yoshihara", "-airflow_permeability", 1e-6,
@@ -161,19 +162,21 @@ def undrained(lab):
     length, width = 10.0, 1.0
     mu, nu = 2 * C, BETA / (2 * BETA + 1)
     inertia, shear_area = width**4 / 12, 5 / 6 * width**2
-    force = 1e-3  # kPa mm²: the tip moves by 5 % of the length at most
+    force = 1e-4  # kPa mm²: the tip moves by 0.6 % of the length at most
     counts = [(10, 1, 1), (20, 2, 2)] if lab.small else [(10, 1, 1), (20, 2, 2), (40, 4, 4)]
     tip = {}
     soft = ["-tissue", "yoshihara"]
-    rigid = ["-tissue", "berger", "-tissue_mu", mu, "-tissue_lambda", 1e4 * mu, "-tissue_phi0", 1]
-    for name, law, k, poisson in (("drained", soft, 1e8, nu), ("undrained", soft, 1e-12, 0.5),
-                                  ("skeleton of ν = 0.49995, drained", rigid, 1e12, 1e4 / (2 * (1e4 + 1)))):
+    rigid = ["-tissue", "berger", "-tissue_mu", mu, "-tissue_lambda", 1e3 * mu, "-tissue_phi0", 1]
+    gas = ["-airflow", "-airflow_surfaces", "x1", "-airflow_permeability", 1e-12]
+    scenes = [("drained", soft, nu), ("undrained", soft + gas, 0.5)]
+    if not lab.small:
+        scenes.append(("skeleton of ν = 0.4995, drained", rigid, 1e3 / (2 * (1e3 + 1))))
+    for name, law, poisson in scenes:
         E = 2 * mu * (1 + poisson)
         exact = force * length**3 / (3 * E * inertia) + force * length / (mu * shear_area)
         for n in counts:
-            run = lab.finished(pulmo.DIRECT + ATOL + meshes.box_options(n, (length, width, width)) + law + [
-                "-airflow", "-airflow_surfaces", "x1", "-airflow_permeability", k, "-support", "-support_surfaces", "x0",
-                "-traction", "-traction_surfaces", "x1", "-traction_value", f"0,0,{force / width**2}",
+            run = lab.finished(pulmo.DIRECT + meshes.box_options(n, (length, width, width)) + law + [
+                "-support", "-support_surfaces", "x0", "-traction", "-traction_surfaces", "x1", "-traction_value", f"0,0,{force / width**2}",
                 "-ts_dt", 1, "-ts_max_time", 1], f"{name}, {n}")
             if run is None:
                 continue

@@ -20,6 +20,7 @@ case{where}; they depend on the machine.
 
 **{met} of {demands} demands are met, {cases_met} of {cases} cases in full.**{size}
 """
+NOT_RUN = "Without a result at this size yet (run `tools/hard_cases`): {names}."
 
 
 def mended(text):
@@ -37,12 +38,15 @@ def short(result):
     return "<br>".join([f"{met} of {len(result['demands'])} met", *map(demand_line, missed)])
 
 
-def write(folder, results, machine, small):
+def write(folder, results, missing, machine, small):
+    """`missing`: titles of the cases that have no result."""
     folder.mkdir(parents=True, exist_ok=True)
     demands = [d for r in results for d in r["demands"]]
     text = [HEAD.format(met=sum(d["met"] for d in demands), demands=len(demands), cases=len(results),
                         cases_met=sum(r["met"] for r in results), where=f" ({machine})",
                         size=" **Small size: not the gallery's figures.**" if small else "")]
+    if missing:
+        text += [NOT_RUN.format(names="; ".join(missing)), ""]
     header = ["case", "why it is hard", "result", "steps, cut", "min J", "recovery path", "CPU s"]
     text += markdown(header, [[f"[{r['title']}](#{r['name']})", mended(r["why"]), short(r), f"{r['steps']}, {r['cut']}",
                                "–" if r["min_J"] is None else f"{r['min_J']:.3g}", mended(r["recovery"]), f"{r['cpu_s']:.0f}"]
