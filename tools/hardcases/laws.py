@@ -114,7 +114,7 @@ def plateau(lab):
 
 @case("CM2's exponential at large stretch")
 def exponential(lab):
-    """exp(g (J^(2/3) − 1)²) overflows for J above some 7000: a Newton step too far makes infinity, and a line search that
+    """exp(g (J^(2/3) − 1)²) overflows for J above some 230: a Newton step too far makes infinity, and a line search that
     believes it loses the state."""
     for pressure in [100, 1000] if lab.small else [100, 1000, 10000]:
         J = inflated("ma", pressure, 1, 100)
