@@ -275,7 +275,7 @@ public:
     const Clock clock(*this, reinterpret_cast<void (*)(void)>(f));
     for (PetscInt q = 0; q < data.fields->points; ++q)
       f(dim, data.fields->n, precomputed_state, data.fields->uOff, data.fields->uOff_x, u(q), u_t(q), u_x(q), nullptr,
-        nullptr, state(q), nullptr, nullptr, t, data.x + q * dim, nc, constants, out + q * stride);
+        data.fields->uOff_x, state(q), nullptr, rate_x(q), t, data.x + q * dim, nc, constants, out + q * stride);
   }
   void operator()(PetscPointJac g, PetscScalar *out, PetscInt stride) const
   {
@@ -327,6 +327,7 @@ private:
   const PetscScalar *u(PetscInt q) const { return data.u + q * data.fields->total_components; }
   const PetscScalar *u_t(PetscInt q) const { return data.u_t + q * data.fields->total_components; }
   const PetscScalar *u_x(PetscInt q) const { return data.u_x + q * data.fields->total_components * dim; }
+  const PetscScalar *rate_x(PetscInt q) const { return data.rate_x + q * data.fields->total_components * dim; }
   const PetscScalar *state(PetscInt q) const { return reinterpret_cast<const PetscScalar *>(&data.states[q]); }
 
   const PointData &data;

@@ -88,6 +88,26 @@ PetscErrorCode keep_last_state(Checkpoint &checkpoint, const Simulation &simulat
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+/// Says when the run first left the range of the model: below J = 1 - Phi0 the porosity is negative, and no tissue law
+/// but berger keeps J from it.
+PetscErrorCode warn_of_no_air(MPI_Comm comm, const Scene &scene, const Simulation &simulation)
+{
+  PetscFunctionBeginUser;
+  if (!scene.facts().airflow) PetscFunctionReturn(PETSC_SUCCESS);
+  const PetscReal least = 1 - scene.airflow().porosity();
+  for (const SignalRow &row : simulation.rows()) {
+    if (row.min_J >= least) continue;
+    PetscCall(
+        PetscPrintf(comm,
+                    "pulmo: warning: at t = %g s the porosity falls below zero: J = %g is less than 1 - Phi0 = %g "
+                    "(-airflow_porosity %g), so that there would be less than no air; from there on the numbers mean "
+                    "nothing. What to try: less suction, -tissue berger, a larger -airflow_porosity\n",
+                    (double)row.time, (double)row.min_J, (double)least, (double)scene.airflow().porosity()));
+    break;
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 } // namespace
 
 PetscErrorCode initialize()
@@ -195,6 +215,7 @@ PetscErrorCode run(const Registry &registry, bool &finished)
     if (simulation.stopped()) PetscCall(stop(checkpoint, simulation, signal.name()));
   }
   PetscCall(options.warn_unused());
+  PetscCall(warn_of_no_air(comm, scene, simulation));
   if (view_effects) PetscCall(print_ledger(comm, scene, run.model(), simulation.seconds()));
   if (audit_energy) PetscCall(write_energy(comm, output, simulation, energy));
   if (!finished) {

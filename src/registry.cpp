@@ -3,6 +3,7 @@
 #include "pulmo/effects/airflow.hpp"
 #include "pulmo/effects/chest_wall.hpp"
 #include "pulmo/effects/lumen_pressure.hpp"
+#include "pulmo/effects/pressure_damping.hpp"
 #include "pulmo/effects/support.hpp"
 #include "pulmo/effects/traction.hpp"
 #include "pulmo/effects/tube.hpp"
@@ -28,6 +29,7 @@ Registry Registry::standard()
   // effects beside tissue, airflow and ventilator
   r.effect<ChestWall>();
   r.effect<LumenPressure>();
+  r.effect<PressureDamping>();
   r.effect<Support>();
   r.effect<Traction>();
   r.effect<Tube>();

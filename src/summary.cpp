@@ -211,6 +211,7 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
     if (model.composition().supported())
       json["support_reaction_n"] = simulation.support_reaction() * units::newton_per_kPa_mm2;
     json["min_jacobian"] = simulation.min_J();
+    if (scene.facts().airflow) json["min_porosity"] = 1 - (1 - scene.airflow().porosity()) / simulation.min_J();
     json["end_time_s"] = simulation.time();
     json["steps"] = simulation.rows().size() - 1;
     json["rejected_steps"] = simulation.rejected_steps();

@@ -79,12 +79,13 @@ struct Point {
   const PetscReal *x;        ///< material coordinates, mm
   const PetscReal *normal;   ///< outward unit normal (surface kernels only)
   Step step;
+  const PetscScalar *grad_p_t = nullptr; ///< Grad p_t, kPa/(mm s) (residual terms of the volume, with airflow)
 
   /// Pressure of the gas in the pores: the local field, or the uniform pressure without airflow, kPa.
   PetscScalar gas_pressure() const { return grad_p ? p : step.gas_pressure; }
 };
 
-/// NfAux that says: the auxiliary array is a PointState made by pulmo's integrator.
+/// NfAux that says: the auxiliary array is a PointState made by pulmo's integrator, its gradients those of the rates.
 constexpr PetscInt precomputed_state = -1;
 
 namespace detail {
@@ -96,7 +97,7 @@ namespace detail {
       const PetscScalar[], const PetscScalar a_x[], PetscReal t
 
 /// The point of a callback. Its kinematic state is handed in by pulmo's integrator, or made here in @p storage
-/// (stock PetscFE, where an auxiliary field of the same discretisation carries u_t).
+/// (stock PetscFE, where auxiliary fields of the same discretisation carry u_t and p_t).
 static inline Point make_point(PointState &storage, PetscInt Nf, PetscInt NfAux, const PetscInt uOff[],
                                const PetscInt uOff_x[], const PetscScalar u[], const PetscScalar u_x[],
                                const PetscInt aOff_x[], const PetscScalar a[], const PetscScalar a_x[], PetscReal t,
@@ -112,7 +113,8 @@ static inline Point make_point(PointState &storage, PetscInt Nf, PetscInt NfAux,
           shift,
           x,
           normal,
-          constants::get<Step>(c)};
+          constants::get<Step>(c),
+          gas && a_x && (made || NfAux > pressure) ? a_x + aOff_x[pressure] : nullptr};
 }
 
 } // namespace detail

@@ -1,10 +1,18 @@
 #!/usr/bin/python3
-"""A run never passes a state that is turned inside out: it gets past by smaller steps, or it stops and says why."""
+"""A run never passes a state that is turned inside out: it gets past by smaller steps, or it stops and says why.
+
+Also the small size of every case of the gallery (tools/hard_cases), which defines its scenes and demands once.
+"""
+import os
+import sys
 import unittest
 
 import numpy as np
 
 import pulmo_case as pulmo
+
+sys.path.insert(0, os.path.join(pulmo.SOURCE, "tools"))
+from hardcases import gallery  # noqa: E402
 
 QUIET = ["-progress", "off"]
 BERGER = pulmo.DIRECT + pulmo.PCV + QUIET + ["-tissue", "berger"]
@@ -38,19 +46,6 @@ class Stability(unittest.TestCase):
             if name != "phase":
                 self.assertTrue(np.isfinite(column).all(), name)
 
-    def test_berger_on_the_lung_with_the_papers_traction(self):
-        case = pulmo.Case(BERGER + pulmo.LUNG + ["-ts_max_time", "0.3"])
-        if case.code == 0:
-            self.assertNotIn("failure.json", case.files())
-            self.assert_sound(case, "signals.csv", "summary.json")
-        else:
-            self.expect_stopped(case, "berger")
-
-    def test_berger_on_the_lung_with_lumen_pressure_runs_through(self):
-        case = pulmo.finished(BERGER + pulmo.LUNG + ["-lumen_pressure", "-ts_max_time", "0.3"])
-        self.assert_sound(case, "signals.csv", "summary.json")
-        self.assertAlmostEqual(case.signals()["time_s"][-1], 0.3)
-
     def test_newton_that_converges_to_an_inside_out_state_is_not_believed(self):
         """The airway's rim folds; at the last steps Newton converges, but to J < 0."""
         for ranks in (1, 2):
@@ -65,28 +60,6 @@ class Stability(unittest.TestCase):
         case = pulmo.Case(BERGER + pulmo.LUNG + ["-ventilator_pip", "20", "-ts_adapt_dt_min", "1e-3",
                                                  "-ts_max_time", "0.3"])
         self.expect_stopped(case, "The tissue turned inside out: J = -")
-
-    def test_no_equilibrium_above_the_limit_point(self):
-        """Unrestrained CM4 has a limit point at 16.83 cmH2O with J = 2.534 (docs: loss of ellipticity)."""
-        options = pulmo.DIRECT + pulmo.CUBE + QUIET + [
-            "-tissue", "yoshihara", "-ventilator", "pcv", "-ventilator_ramp", "1", "-support", "-support_rigid"]
-        case = pulmo.Case(options + ["-ventilator_pip", "20"])
-        self.expect_stopped(case, "the law may have no equilibrium at this pressure", "yoshihara")
-        last = {name: column[-1] for name, column in case.signals("signals.csv.part").items()}
-        self.assertLess(last["airway_pressure_cmH2O"], 16.8275)
-        self.assertGreater(last["airway_pressure_cmH2O"], 16.80)
-        self.assertLess(last["min_J"], 2.534)
-        self.assertGreater(last["min_J"], 2.4)
-        below = pulmo.finished(options + ["-ventilator_pip", "16.7", "-ts_max_time", "1"])
-        self.assert_sound(below, "signals.csv", "summary.json")
-        # J of the homogeneous state: p = 2 c (J^-1/3 - J^(-2 beta - 1)), c 1.298 kPa, beta 0.75, by bisection
-        low, high = 1.0, 2.534
-        for _ in range(60):
-            J = (low + high) / 2
-            p = 2 * 1.298 * (J ** (-1 / 3) - J ** -2.5)
-            low, high = (J, high) if p < 16.7 * pulmo.KPA_PER_CMH2O else (low, J)
-        self.assertAlmostEqual(below.signals()["min_J"][-1], J, places=5)
-        self.assertAlmostEqual(below.signals()["max_J"][-1], J, places=5)
 
     def test_steps_are_cut_and_grow_back(self):
         """The whole pressure in the first step is too much for the default step; later the step asked for returns.
@@ -112,6 +85,25 @@ class Stability(unittest.TestCase):
                 np.testing.assert_allclose(rows["airway_pressure_cmH2O"], pip * np.minimum(1, time / (ramp or 0.05)),
                                            rtol=1e-9)
 
+
+class Gallery(unittest.TestCase):
+    """tools/hard_cases at the size of a test."""
+
+
+def add(name):
+    def test(self):
+        result = gallery.run_case(name, pulmo.PROGRAM, small=True)
+        self.assertGreater(len(result["demands"]), 0)
+        for demand in result["demands"]:
+            with self.subTest(demand["what"]):
+                self.assertTrue(demand["met"], f"{demand['measured']} for {demand['asked']}")
+
+    test.__doc__ = gallery.CASES[name].title
+    setattr(Gallery, "test_" + name, test)
+
+
+for _name in gallery.CASES:
+    add(_name)
 
 if __name__ == "__main__":
     pulmo.main()

@@ -60,6 +60,7 @@ std::vector<Case> cases()
   list.push_back(
       {"normal springs", breath + gas + springs + "-chest_wall_direction normal -chest_wall_surfaces pleura "});
   list.push_back({"no springs", breath + gas + "-support -support_rigid "});
+  list.push_back({"damped pressure", breath + gas + springs + "-pressure_damping "});
   list.push_back({"no airflow", breath + springs});
   list.push_back(
       {"no airflow, normal springs, wall pressure", breath + springs +

@@ -303,6 +303,18 @@ TEST(WeakForm, EveryColumnOfTheJacobianForEveryLawAndAnyShift)
     }
 }
 
+TEST(WeakForm, EveryColumnOfTheJacobianWithDampedPressure)
+{
+  SceneSpec scene = full_scene(true);
+  scene.more = "-pressure_damping -pressure_damping_length 0.4 -pressure_damping_modulus 0.1";
+  const Registry registry = Registry::standard();
+  SceneRun run(registry);
+  State s;
+  PULMO_OK(prepare(run, scene.options()));
+  PULMO_OK(random_state(run, 350, s));
+  expect_jacobian(run, s, 2.3, 3e-8);
+}
+
 /// k(J) = k J^3: exercises dk/dJ in the assembled system.
 struct CubicPermeability {
   static constexpr const char *name = "cubic";
@@ -450,6 +462,13 @@ TEST(Integration, AgreesWithPetscForEveryLaw)
 {
   for (const char *law : {"berger", "ma", "birzle", "yoshihara", "rausch"})
     for (bool airflow : {false, true}) expect_same_integration(full_scene(airflow, law), 40, 1e-12);
+}
+
+TEST(Integration, AgreesWithPetscForDampedPressure)
+{
+  SceneSpec scene = full_scene(true);
+  scene.more = "-pressure_damping -pressure_damping_length 0.4 -pressure_damping_modulus 0.1";
+  expect_same_integration(scene, 60, 1e-12);
 }
 
 TEST(Integration, AgreesWithPetscForOtherDegreesOfQuadrature)

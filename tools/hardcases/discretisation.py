@@ -1,0 +1,238 @@
+"""Hard cases of mesh and coefficients: permeabilities far apart, incompressible response, bad cells."""
+import json
+import subprocess
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.linalg import spsolve
+
+from . import meshes
+from .lab import case, fields, pulmo
+from .laws import inflated
+from .loads import ITERATIVE
+
+C, BETA = 1.298, 0.75  # Yoshihara's law
+MODULUS = 2 * C * (1 + (2 * BETA + 1))  # W'' of uniaxial strain at rest, kPa
+LOAD = 1e-4  # kPa: strains of 1e-5
+
+
+def column(mesh, sides, k, dt, end, solver=pulmo.TIGHT, load=LOAD):
+    """A column on rollers, drained and loaded at x1, sealed at x0 (Terzaghi)."""
+    rollers = ["-support", "-support_surfaces", ",".join(["x0", *sides])] + ["-support_components_x0", "x"]
+    for side in sides:
+        rollers += [f"-support_components_{side}", "y" if "y" in side else "z"]
+    return solver + mesh + rollers + ["-tissue", "yoshihara", "-airflow", "-airflow_surfaces", "x1", "-airflow_permeability", k,
+                                      "-traction", "-traction_surfaces", "x1", "-traction_value", f"{-load},0,0",
+                                      "-ts_dt", dt, "-ts_max_time", end]
+
+
+BOX_SIDES = ["y0", "y1", "z0", "z1"]
+COLUMN = (["-dm_plex_filename", pulmo.mesh("column.msh"), "-mesh_scale", 100], ["sides_y", "sides_z"])
+
+
+def first_step(x, length, k, dt):
+    """p/p0 after one step of backward Euler from rest: 1 − cosh(x/l)/cosh(L/l), l² = c_v Δt; small strains."""
+    layer = np.sqrt(k * MODULUS * dt)
+    return 1 - np.exp((x - length) / layer) * (1 + np.exp(-2 * x / layer)) / (1 + np.exp(-2 * length / layer))
+
+
+def projected(x, cells, drained):
+    """P1 projection (L2) of p/p0 = 1 with p = 0 at the drained nodes: what the mesh can show of a layer without thickness."""
+    corners = x[cells]
+    volume = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / 6
+    local = (np.ones((4, 4)) + np.eye(4)) / 20
+    rows, columns = np.repeat(cells, 4, axis=1).ravel(), np.tile(cells, 4).ravel()
+    mass = sp.coo_matrix(((volume[:, None, None] * local).ravel(), (rows, columns)), shape=(len(x),) * 2).tocsr()
+    inner = ~drained & np.isin(np.arange(len(x)), cells)
+    load = np.bincount(cells.ravel(), np.repeat(volume / 4, 4), minlength=len(x))
+    p = np.zeros(len(x))
+    p[inner] = spsolve(mass[inner][:, inner].tocsc(), load[inner])
+    return p
+
+
+def pressures(run):
+    """Vertices' coordinates, p over the load, corners of the cells and the vertices' numbers."""
+    x, cells, values = fields(run)
+    corners = cells[:, :4]
+    vertices = np.unique(corners)
+    return x, values["pressure"] / LOAD, corners, vertices
+
+
+@case("Very low permeability: 10⁴ to 10⁻⁶, first step far below h²/(6 c_v)")
+def tight(lab):
+    """The layer that drains in the first step is thinner than a cell. P2–P1 is inf-sup stable, so the pressure stays
+    bounded, but a jump that the mesh cannot show leaves ripples beside it (Vermeer & Verruijt 1981)."""
+    length, h, dt = 100.0, 4.5, 0.05  # mm, mm, s
+    errors = {}
+    for damped in ("", " damped"):
+        overshoots = []
+        for e in [4, 0, -6] if lab.small else range(4, -7, -1):
+            k = 10.0**e
+            flags = ["-pressure_damping", "-pressure_damping_modulus", MODULUS] if damped else []
+            run = lab.finished(column(*COLUMN, k, dt, dt) + flags, f"k = 1e{e}{damped}")
+            if run is None:
+                continue
+            x, p, corners, vertices = pressures(run)
+            exact = first_step(x[:, 0], length, k, dt)
+            overshoots.append([dt * k * MODULUS * 6 / h**2, p[vertices].max(), p[vertices].min()])
+            errors[e, damped] = np.sqrt(np.mean((p - exact)[vertices] ** 2))
+            far = vertices[x[vertices, 0] < length - 4 * h]
+            if not damped and e in (4, 0, -6):
+                lab.below(f"k = 1e{e}: |p − closed form|/p0 beyond 4 h from the drained end", np.abs(p - exact)[far].max(), 0.01)
+            if e != -6:
+                continue
+            lab.above(f"k = 1e-6{damped}: least p/p0", p[vertices].min(), -1e-9)
+            if damped or not lab.small:
+                lab.below(f"k = 1e-6{damped}: largest p/p0 (1.27: P1 in one dimension)", p[vertices].max(), 1.27)
+            if not damped:
+                jump = projected(x, corners, np.abs(x[:, 0] - length) < 1e-6)
+                lab.within("k = 1e-6: largest p/p0 beside that of the P1 projection of the jump (the mesh's, no instability)",
+                           p[vertices].max(), jump[vertices].max(), 0.01)
+            order = vertices[np.argsort(x[vertices, 0])]
+            lab.curves["profile" + damped] = [x[order, 0].tolist(), p[order].tolist()]
+        lab.curves["overshoot" + damped] = overshoots
+    if (-6, " damped") in errors and (4, " damped") in errors:
+        lab.below("k = 1e-6: rms error of p with -pressure_damping over that without", errors[-6, " damped"] / errors[-6, ""], 1)
+        lab.below("its cost at k = 1e4: rms error of p/p0 with it", errors[4, " damped"], 1e-3)
+        lab.demand("k = 1e4: rms error of p/p0 without", errors[4, ""], "for comparison", True)
+    if not lab.small:
+        breath = pulmo.DIRECT + pulmo.PCV + pulmo.LUNG + ["-ts_max_time", 0.5]
+        plain, damped = lab.finished(breath, "breath"), lab.finished(breath + ["-pressure_damping"], "breath, damped")
+        if plain and damped:
+            a, b = plain.signals()["volume_ml"], damped.signals()["volume_ml"]
+            lab.below("its cost in a usual breath (k = 1e4, cells of 20 mm): largest change of V over the largest V",
+                      np.abs(a - b).max() / a.max(), 0.01)
+    for name, scene, flags in (("pressure control", pulmo.PCV, []), ("volume control", pulmo.VCV, ["-ventilator_tidal_volume", 0.2])):
+        for file in [pulmo.DIRECT] if lab.small else [pulmo.DIRECT, ITERATIVE]:
+            run = lab.finished(file + scene + pulmo.LUNG + flags + ["-tissue", "yoshihara", "-airflow_permeability", 1e-6,
+                                                                   "-ts_max_time", 0.2, "-lumen_pressure"], f"lung, {name}")
+            if run:
+                lab.below(f"lung under {name}, {'direct' if file is pulmo.DIRECT else 'iterative'}: mass balance (ml)",
+                          run.json()["mass_balance_error_ml"], 1e-6)
+
+
+@case("Very high permeability: 10¹⁰")
+def open_tissue(lab):
+    """The pressure is uniform to 10 digits: the flux is a large number times a small gradient."""
+    controls = [("pressure control", pulmo.PCV, [])]
+    if not lab.small:
+        controls.append(("volume control", pulmo.VCV, pulmo.COMMON + ["-ventilator_tidal_volume", 250]))
+    for name, scene, flags in controls:
+        base = scene + pulmo.LUNG + flags + ["-tissue", "yoshihara", "-ts_max_time", 0.3]
+        still = lab.finished(pulmo.DIRECT + base + ["-airflow", "off"], "no airflow")
+        gaps = {}
+        for k in (1e8, 1e10):
+            run = lab.finished(pulmo.DIRECT + base + ["-airflow_permeability", k], f"k {k:g}")
+            if run and still:
+                cut = run.json()["rejected_steps"]
+                lab.demand(f"{name}, k = {k:g}: steps cut", cut, "0", cut == 0)
+                column_name = "volume_ml" if scene is pulmo.PCV else "airway_pressure_cmH2O"
+                mine, other = run.signals(), still.signals()
+                both = [(i, j) for i, t in enumerate(mine["time_s"]) for j in np.flatnonzero(np.abs(other["time_s"] - t) < 1e-9)]
+                a, b = (rows[column_name][list(at)] for rows, at in zip((mine, other), zip(*both)))
+                gaps[k] = np.abs(a - b).max() / np.abs(b).max()
+        if len(gaps) == 2:
+            lab.below(f"{name}: difference from a lung without airflow at 1e10", gaps[1e10], 1e-5)
+            lab.within(f"{name}: it falls as 1/k, from 1e8 to 1e10", gaps[1e8] / gaps[1e10], 100, 0.1)
+        run = lab.finished(ITERATIVE + base + ["-airflow_permeability", 1e10], f"{name}, iterative.opts")
+        if run:
+            lab.below(f"{name}: Krylov per Newton iteration",
+                      run.json()["krylov_iterations"] / run.json()["newton_iterations"], 15 if scene is pulmo.PCV else 30)
+
+
+@case("Permeability and stiffness jumps of 10⁶ between regions")
+def jumps(lab):
+    """Collapsed beside open tissue: coefficients of one matrix six decades apart across one face. pulmo has no parameters by
+    region yet; a test effect adds them (tests/cases/jumps.cpp)."""
+    program = lab.build / "tests/cases/stability_jumps"
+    if not program.exists():
+        lab.demand("the test program", "not built", str(program.name), False)
+        return
+    run = subprocess.run([program], cwd=pulmo.SOURCE, env=pulmo.ENVIRONMENT, capture_output=True, text=True, timeout=300)
+    for line in run.stdout.splitlines():
+        if line.startswith("demand "):
+            lab.demands.append(json.loads(line[7:]))
+    lab.demand("all its assertions", "hold" if run.returncode == 0 else "fail", "hold", run.returncode == 0)
+
+
+@case("Undrained limit: a beam that cannot change its volume")
+def undrained(lab):
+    """Air that cannot leave makes the tissue incompressible: elements that lock are too stiff by factors in bending.
+    (Cook's membrane and its rates: tests/verification.)"""
+    length, width = 10.0, 1.0
+    mu, nu = 2 * C, BETA / (2 * BETA + 1)
+    inertia, shear_area = width**4 / 12, 5 / 6 * width**2
+    force = 1e-4  # kPa mm²: the tip moves by 0.6 % of the length at most
+    counts = [(10, 1, 1), (20, 2, 2)] if lab.small else [(10, 1, 1), (20, 2, 2), (40, 4, 4)]
+    tip = {}
+    soft = ["-tissue", "yoshihara"]
+    rigid = ["-tissue", "berger", "-tissue_mu", mu, "-tissue_lambda", 1e3 * mu, "-tissue_phi0", 1]
+    gas = ["-airflow", "-airflow_surfaces", "x1", "-airflow_permeability", 1e-12]
+    scenes = [("drained", soft, nu), ("undrained", soft + gas, 0.5)]
+    if not lab.small:
+        scenes.append(("skeleton of ν = 0.4995, drained", rigid, 1e3 / (2 * (1e3 + 1))))
+    for name, law, poisson in scenes:
+        E = 2 * mu * (1 + poisson)
+        exact = force * length**3 / (3 * E * inertia) + force * length / (mu * shear_area)
+        for n in counts:
+            run = lab.finished(pulmo.DIRECT + meshes.box_options(n, (length, width, width)) + law + [
+                "-support", "-support_surfaces", "x0", "-traction", "-traction_surfaces", "x1", "-traction_value", f"0,0,{force / width**2}",
+                "-ts_dt", 1, "-ts_max_time", 1], f"{name}, {n}")
+            if run is None:
+                continue
+            x, _, values = fields(run)
+            u = values["displacement"].reshape(-1, 3)
+            tip[name, n] = u[np.abs(x[:, 0] - length) < 1e-9, 2].mean() / exact
+        if (name, counts[-1]) in tip:
+            lab.within(f"{name}: tip over Timoshenko's beam, {counts[-1][0]} × {counts[-1][1]} × {counts[-1][2]} cubes",
+                       tip[name, counts[-1]], 1, 0.05 if lab.small else 0.03)
+            lab.above(f"{name}: the same with one cube over the height", tip[name, counts[0]], 0.9)
+
+
+@case("Stretched cells (100 : 1), slivers, cells with all nodes on the boundary")
+def bad_cells(lab):
+    """Gradients across flat cells cancel, smoothers and AMG see couplings 10⁴ apart, and a cell without an inner node has
+    little freedom."""
+    length, k, n = 1.0, 1 / MODULUS, 10  # c_v = 1 mm²/s
+    dt = 0.05
+    flat = meshes.box((n, 3, 3), (length, 0.3, 0.3), flatten=0.93)
+    facets = meshes.boundary(flat[1])
+    lab.below("quality of the flattest sliver (1: regular)", meshes.quality(*flat), 1e-2)
+    columns = {"cubes": meshes.box_options((n, 2, 2), (length, 0.2, 0.2)),
+               "plates 100 : 1": meshes.box_options((n, 2, 2), (length, 20, 20)),
+               "plates 100 : 1, finer": None if lab.small else meshes.box_options((2 * n, 4, 4), (length, 20, 20)),
+               "slivers": meshes.write(*flat, facets, meshes.faces_of_box(flat[0], facets, (length, 0.3, 0.3))),
+               "no inner node": meshes.box_options((n, 1, 1), (length, 0.1, 0.1))}
+    errors = {}
+    for name, mesh in columns.items():
+        if mesh is None:
+            continue
+        for solver, file in (("direct", pulmo.TIGHT), ("iterative", ITERATIVE)):
+            run = lab.finished(column(mesh, BOX_SIDES, k, dt, dt, solver=file), f"{name}, {solver}")
+            if run is None:
+                continue
+            x, p, _, vertices = pressures(run)
+            error = np.sqrt(np.mean((p - first_step(x[:, 0], length, k, dt))[vertices] ** 2))
+            errors[name, solver] = error
+            lab.below(f"{name}, {solver}: rms error of p/p0 against the closed form", error, 0.02)
+            if solver == "iterative" and not lab.small:
+                numbers = run.json()
+                lab.below(f"{name}: Krylov per Newton iteration", numbers["krylov_iterations"] / numbers["newton_iterations"], 30)
+    if not lab.small:
+        both = [errors.get((f"plates 100 : 1{finer}", "direct")) for finer in ("", ", finer")]
+        if all(both):
+            lab.above("plates: order of the rms error of p", np.log2(both[0] / both[1]), 1.5)
+        lab.finished(column(meshes.box_options((2 * n, 2, 2), (length, 20, 20)), BOX_SIDES, k, dt, dt, solver=ITERATIVE),
+                     "plates 200 : 1, iterative")
+    # one cube of six cells, all nodes on its boundary
+    points, tets = meshes.box((1, 1, 1), (10, 10, 10))
+    facets = meshes.boundary(tets)
+    faces = ["airway" if f == "x1" else "pleura" for f in meshes.faces_of_box(points, facets, (10, 10, 10))]
+    run = lab.finished(pulmo.DIRECT + pulmo.PCV + meshes.write(points, tets, facets, faces) + [
+        "-tissue", "yoshihara", "-airflow_permeability", 100, "-ts_max_time", 1], "six cells, a breath")
+    if run:
+        lab.below("six cells: energy balance, residual over work", run.json()["energy_j"]["residual_relative"], 1e-8)
+    run = lab.finished(pulmo.DIRECT + pulmo.STILL + pulmo.PINS + meshes.write(points, tets, facets, faces) + [
+        "-tissue", "yoshihara", "-ventilator", "pcv", "-ventilator_pip", 12, "-ventilator_ramp", 1, "-ts_max_time", 1], "free")
+    if run:
+        lab.within("six cells: J at 12 cmH2O, free", run.signals()["max_J"][-1], inflated("yoshihara", 12, 1, 2.53), 1e-7)

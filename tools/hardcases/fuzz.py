@@ -1,0 +1,116 @@
+"""Random scenes that are physically admissible: each has to finish with J > 0, or to stop with a clear message."""
+import math
+import random
+
+from . import meshes
+from .lab import case, first_sentence, pulmo
+
+TISSUE = {"berger": {"mu": 0.2808, "lambda": 0.4212}, "ma": {"c": 2}, "birzle": {"c": 0.3567, "c1": 0.2782, "c3": 5.766e-3},
+          "yoshihara": {"c": 1.298, "beta": 0.75}, "rausch": {"c_q": 4.1, "c_c": 20.7, "kappa": 16.5}}
+SOLVERS = ["direct", "reuse", "iterative"]
+
+
+def between(dice, low, high):
+    """Log-uniform, four digits."""
+    return float(f"{math.exp(dice.uniform(math.log(low), math.log(high))):.4g}")
+
+
+def programme(dice, volume):
+    """Phases of pressure, flow and hold that a ventilator could be set to; the lung never holds more than 70 % of itself."""
+    lines, inside = [], 0.0
+    for _ in range(dice.randint(2, 5)):
+        duration = between(dice, 0.05, 0.6)
+        kind = dice.choice(["pressure", "flow", "hold"])
+        if kind == "hold":
+            lines.append(f"pause {duration} hold")
+        elif kind == "pressure":
+            ramp = f" ramp {dice.choice([0.2, 0.9]) * duration:.4g}" if dice.random() < 0.6 else ""
+            lines.append(f"{dice.choice(['inspiration', 'expiration'])} {duration} pressure {dice.uniform(-5, 25):.4g}{ramp}")
+            inside = 0.3 * volume
+        else:
+            into = dice.uniform(-0.5 * inside, 0.7 * volume - inside)
+            inside += max(into, 0)
+            limit = f" limit {dice.uniform(5, 30):.4g}" if dice.random() < 0.3 and into > 0 else ""
+            lines.append(f"inspiration {duration} flow {into / duration:.4g}{limit}")
+    return "\n".join(lines)
+
+
+def scene(dice):
+    """Options and ranks of a random scene, and the text of its programme."""
+    law = dice.choice(list(TISSUE))
+    options = ["-tissue", law]
+    for name, value in TISSUE[law].items():
+        if dice.random() < 0.3:
+            options += [f"-tissue_{name}", f"{value * between(dice, 0.5, 2):.4g}"]
+    size, shape = between(dice, 1, 20), dice.choice(["cube_lung", "box", "lung_test"] if dice.random() < 0.2 else ["cube_lung", "box"])
+    if shape == "box":
+        lengths = [10 * between(dice, 0.3, 3) for _ in range(3)]
+        points, tets = meshes.box([dice.randint(1, 3) for _ in range(3)], lengths)
+        facets = meshes.boundary(tets)
+        names = ["airway" if f == "x1" else "pleura" for f in meshes.faces_of_box(points, facets, lengths)]
+        options += meshes.write(points, tets, facets, names)
+        volume = lengths[0] * lengths[1] * lengths[2]
+    else:
+        options += ["-dm_plex_filename", pulmo.mesh(f"{shape}.msh")]
+        volume = 1e3 if shape == "cube_lung" else 1.35e6
+        size = size if shape == "cube_lung" else 1
+    volume *= size**3 / 1000  # ml
+    options += ["-mesh_scale", size]
+    if dice.random() < 0.8:
+        options += ["-airflow", "-airflow_permeability", between(dice, 1e-3, 1e6) * size**2]
+        if dice.random() < 0.5:
+            options.append("-lumen_pressure")
+        if dice.random() < 0.2:
+            options += ["-airflow_porosity", dice.choice([0.5, 0.8, 0.95])]
+    if dice.random() < 0.75:
+        options += ["-chest_wall", "-chest_wall_stiffness", between(dice, 1e-3, 10) / size,
+                    "-chest_wall_direction", dice.choice(["full", "full", "normal"])]
+        if "normal" in options:  # flat faces: normal springs leave motions free only on meshes like these
+            options += ["-support", "-support_rigid"]
+    else:
+        options += ["-support", "-support_rigid"]
+    kind, text = dice.choice(["pcv", "vcv", "programme"]), ""
+    if kind == "pcv":
+        options += ["-ventilator", "pcv", "-ventilator_pip", f"{dice.uniform(11, 40):.4g}", "-ventilator_peep", dice.choice([0, 0, 5, 10]),
+                    "-ventilator_ramp", dice.choice([0, 0.05, 0.2]), "-ventilator_ramp_down", dice.choice([0, 0.1]),
+                    "-ventilator_inspiration", 0.5, "-ventilator_expiration", 0.5]
+    elif kind == "vcv":
+        options += ["-ventilator", "vcv", "-ventilator_tidal_volume", f"{between(dice, 0.01, 0.6) * volume:.5g}",
+                    "-ventilator_inspiration", dice.choice([0.05, 0.5]), "-ventilator_pause", 0.1, "-ventilator_expiration", 0.5]
+    else:
+        text = programme(dice, volume)
+        options += pulmo.programme(text)
+    if kind != "pcv" and "-airflow" in options:
+        options += ["-ventilator_flow_split", dice.choice(["uniform", "common_pressure"])]
+    if dice.random() < 0.2:
+        options += ["-tube", "-tube_k1", between(dice, 0.5, 20), "-tube_k2", between(dice, 0.5, 20)]
+    solver = dice.choice(SOLVERS[:2] if law == "rausch" else SOLVERS)
+    ranks = 2 if dice.random() < 0.15 else 1
+    return (pulmo.options_file(f"solvers/{solver}.opts") + options + ["-ts_dt", dice.choice([0.01, 0.05, 0.05, 0.2]),
+            "-ts_adapt_dt_min", 1e-6, "-ts_max_time", 0.8], ranks, text)
+
+
+@case("Random admissible scenes (seeded)")
+def fuzz(lab):
+    """Laws, parameters, meshes, springs, permeabilities, manoeuvres, steps, solvers and ranks drawn together: combinations that
+    nobody thought of."""
+    count, finished, stopped, faults = (15 if lab.small else 200), 0, 0, []
+    for seed in range(count):
+        options, ranks, text = scene(random.Random(seed))
+        try:
+            run = lab.run(options, ranks=ranks, timeout=120, sound=False)
+            fault = lab.fault(run)
+        except AssertionError as error:
+            run, fault = None, str(error).splitlines()[0][:150]
+        if not fault and not run.finished and "What to try: " not in run.err:
+            fault = "stopped without saying what to try: " + first_sentence(run.err)[:200]
+        if fault:
+            faults.append(f"seed {seed}: {fault}")
+        elif run.finished:
+            finished += 1
+        else:
+            stopped += 1
+    lab.demand("scenes that finished with J > 0", finished, f"most of {count}", finished > count / 2)
+    lab.demand("scenes that stopped with one clear sentence", stopped, "the rest", finished + stopped + len(faults) == count)
+    lab.demand("crash, NaN in a file, hang, PETSc trace, silence", "; ".join(faults[:6]) or "none", "none", not faults)
+    lab.said = lab.said[:1]

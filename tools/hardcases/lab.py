@@ -1,0 +1,210 @@
+"""Where a hard case runs: it starts pulmo, reads what it leaves, and writes down each demand with the number measured.
+
+Every run is held to what is asked of all of them, whatever the case: it ends in time; it finishes, or it stops with one
+sentence; no accepted state has J <= 0; no file holds a number that is none.
+"""
+import json
+import math
+import os
+import re
+import resource
+import sys
+import tempfile
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent.parent / "tests/cases"))
+import pulmo_case as pulmo  # noqa: E402
+
+CASES = {}  # name -> function, in the order of the page
+
+
+def case(title):
+    """Makes a function of a Lab a case of the gallery; its docstring says why the case is hard."""
+    def add(function):
+        function.title = title
+        CASES[function.__name__] = function
+        return function
+    return add
+
+
+def number(v):
+    """A measured number, short."""
+    return f"{v:.6g}" if isinstance(v, (float, np.floating)) else str(v)
+
+
+def children_cpu():
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def first_sentence(text):
+    """What pulmo said when it stopped, without the list of attempts."""
+    said = re.search(r"pulmo: error: (.*)", text)
+    return re.split(r"\.\s+(?=[A-Z])", said.group(1))[0] if said else ""
+
+
+def broken_numbers(run):
+    """Names of the files of a run that hold NaN or infinity (fields: of what its mesh has)."""
+    bad = []
+    for name in run.files():
+        path = run.path(name)
+        if name.endswith(".json"):  # null stands for a number that is not defined
+            text = Path(path).read_text()
+            json.loads(text)
+            if re.search(r"\b(nan|inf|infinity)\b", re.sub(r'"[^"]*"', "", text), re.I):
+                bad.append(name)
+        elif name.endswith((".csv", ".csv.part")):
+            if re.search(r"(^|,)-?(nan|inf)(?=,|$)", Path(path).read_text(), re.I | re.M):
+                bad.append(name)
+        elif re.fullmatch(r"fields_\d+\.h5", name):
+            with h5py.File(path) as file:
+                if not all(np.isfinite(values[()]).all() for values in file.values() if isinstance(values, h5py.Dataset)):
+                    bad.append(name)
+    return bad
+
+
+class Lab:
+    """One case: its runs, its demands."""
+
+    def __init__(self, program, small):
+        pulmo.PROGRAM = str(program)
+        self.small, self.build = small, Path(program).parent
+        self.demands, self.curves = [], {}
+        self.steps = self.cut = self.runs = self.stops = self.most_newton = 0
+        self.cpu, self.min_J, self.said = 0.0, math.inf, []
+
+    # ---- runs
+
+    def run(self, options, ranks=1, timeout=300, sound=True):
+        """A run that may finish or stop; `sound`: held to what is asked of every run."""
+        before = children_cpu()
+        run = pulmo.Case(pulmo.QUIET + list(options), ranks=ranks, timeout=timeout)
+        self.cpu += children_cpu() - before
+        self.runs += 1
+        run.finished = run.code == 0
+        run.sentence = first_sentence(run.err)
+        run.summary_file = "summary.json" if run.finished else "failure.json"
+        run.signals_file = "signals.csv" if run.finished else "signals.csv.part"
+        if run.summary_file in run.files():
+            numbers, rows = run.json(run.summary_file), run.signals(run.signals_file)
+            self.steps += numbers["steps"]
+            self.cut += numbers["rejected_steps"]
+            self.min_J = min(self.min_J, numbers["min_jacobian"])
+            self.most_newton = max(self.most_newton, int(rows["newton_iterations"].max()))
+        if not run.finished:
+            self.stops += 1
+            self.said.append(run.sentence)
+        if sound:
+            fault = self.fault(run)
+            if fault:
+                self.demand("every run ends well or says why", fault, "no fault", False)
+        return run
+
+    @staticmethod
+    def fault(run):
+        """What is wrong with how a run ended; empty if it finished, or stopped as it should."""
+        if "PETSC ERROR" in run.err:
+            return "PETSc trace: " + next(line for line in run.err.splitlines() if "PETSC ERROR" in line)
+        if run.code is None or run.code < 0 or run.code > 1:
+            return f"ended with code {run.code}"
+        if not run.finished and run.err.count("pulmo: error:") != 1:
+            return f"code {run.code} without one sentence: {run.err[-200:]}"
+        if not run.finished and not run.files():
+            return ""  # refused before any work
+        for name in (run.summary_file, run.signals_file):
+            if name not in run.files():
+                return f"no {name}"
+        bad = broken_numbers(run)
+        if bad:
+            return "no number in " + ", ".join(bad)
+        if not run.signals(run.signals_file)["min_J"].min() > 0:
+            return "a row with J <= 0"
+        return ""
+
+    def finished(self, options, what="runs to its end", **arguments):
+        """A run that is asked to finish; None (and a demand missed) if it does not."""
+        run = self.run(options, **arguments)
+        if not run.finished:
+            self.demand(what, f"stopped: {run.sentence}", "finished", False)
+            return None
+        return run
+
+    def stopped(self, options, *words, what="stops and says why", **arguments):
+        """A run that is asked to stop with a sentence that holds `words`, keeping the last good state."""
+        run = self.run(options, **arguments)
+        missing = [w for w in words if w not in run.err]
+        kept = all(name in run.files() for name in ("failure.json", "signals.csv.part", "fields.xdmf"))
+        self.demand(what, "it finished" if run.finished else f"lacks {missing}" if missing else
+                    "kept no state" if not kept else "said so", "said so", not run.finished and not missing and kept)
+        return None if run.finished else run
+
+    # ---- demands
+
+    def demand(self, what, measured, asked, met):
+        self.demands.append({"what": what, "measured": number(measured), "asked": str(asked), "met": bool(met)})
+
+    def within(self, what, measured, expected, share):
+        """Relative to what is expected."""
+        self.demand(what, measured, f"{number(float(expected))} ± {100 * share:.3g} %",
+                    abs(measured - expected) <= share * abs(expected))
+
+    def below(self, what, measured, limit):
+        self.demand(what, float(measured), f"< {limit:.3g}", measured < limit)
+
+    def above(self, what, measured, limit):
+        self.demand(what, float(measured), f"> {limit:.3g}", measured > limit)
+
+    def true(self, what, met):
+        self.demand(what, "yes" if met else "no", "yes", met)
+
+    def met(self):
+        return all(d["met"] for d in self.demands)
+
+    def recovery(self):
+        """What the program did to get through, or that it did not."""
+        parts = [f"{self.cut} steps cut and grown back" if self.cut else "no step cut",
+                 f"up to {self.most_newton} Newton steps in one"]
+        if self.stops:
+            parts.append(f"{self.stops} of {self.runs} runs stopped")
+            parts += [f"“{s[:120]}”" for s in dict.fromkeys(self.said)][:2]
+        return "; ".join(parts)
+
+    def result(self, name, title, why):
+        return {"name": name, "title": title, "why": why, "demands": self.demands, "met": self.met(), "runs": self.runs,
+                "steps": self.steps, "cut": self.cut, "min_J": self.min_J if math.isfinite(self.min_J) else None,
+                "recovery": self.recovery(), "cpu_s": self.cpu, "curves": self.curves}
+
+
+def run_case(name, program, small):
+    """The result of one case; an exception of the case itself is a demand missed."""
+    function, lab = CASES[name], Lab(program, small)
+    try:
+        function(lab)
+    except Exception as error:  # noqa: BLE001: whatever went wrong belongs on the page
+        lab.demand("the case itself runs", f"{type(error).__name__}: {error}"[:400], "no exception", False)
+    return lab.result(name, function.title, " ".join((function.__doc__ or "").split()))
+
+
+def fields(run, step=-1):
+    """Of a snapshot: mid-nodes included coordinates, cells (10 nodes each) and a reader of its values by name."""
+    names = sorted(n for n in run.files() if re.fullmatch(r"fields_\d+\.h5", n))
+    with h5py.File(run.path("fields.h5")) as file:
+        x, cells = file["geometry"][:], file["topology"][:].reshape(-1, 10)
+    with h5py.File(run.path(names[step])) as file:
+        values = {name: file[name][()] for name in file if isinstance(file[name], h5py.Dataset)}
+    return x, cells, values
+
+
+def resident(pid):
+    """Resident memory of a process, bytes; 0 if it has ended."""
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, IndexError):
+        return 0
+
+
+def scratch(name):
+    return os.path.join(tempfile.mkdtemp(dir=pulmo._scratch.name), name)

@@ -1,0 +1,222 @@
+"""Hard cases of load and time: jumps, floods, long and tiny steps, extreme springs, scaled lungs, a thousand breaths."""
+import threading
+from pathlib import Path
+
+import numpy as np
+
+import airway_test
+
+from . import meshes
+from .lab import case, pulmo, resident
+from .laws import inflated
+
+REUSE = pulmo.options_file("solvers/reuse.opts")
+ITERATIVE = pulmo.options_file("solvers/iterative.opts")
+
+
+@case("40 cmH2O in one step")
+def jump(lab):
+    """The whole pressure meets a lung at rest in its first step: no equilibrium is near the start of Newton's method, and
+    with no ramp a shorter step makes the jump no smaller; only the flow limits what happens in it."""
+    if lab.small:
+        cube = pulmo.DIRECT + pulmo.PCV + pulmo.CUBE + ["-tissue", "rausch", "-ventilator_pip", 40, "-airflow_permeability", 1e4]
+        once = lab.finished(cube + ["-ventilator_ramp", 0, "-ts_max_time", 0.3], "rausch on a cube")
+        still = lab.finished(cube + ["-ventilator_ramp", 0.3, "-ts_max_time", 0.3, "-airflow", "off"], "at rest")
+        if once and still:
+            lab.within("V beside that at rest (ml)", once.signals()["volume_ml"][-1], still.signals()["volume_ml"][-1], 1e-6)
+        return
+    for law, wall in (("berger", True), ("ma", True), ("birzle", True), ("yoshihara", False), ("yoshihara", True), ("rausch", False)):
+        name = law + (" with -lumen_pressure" if wall else "")
+        scene = pulmo.DIRECT + pulmo.PCV + pulmo.LUNG + ["-ventilator_pip", 40, "-tissue", law] + ["-lumen_pressure"] * wall
+        once = lab.finished(scene + ["-ventilator_ramp", 0, "-ts_max_time", 0.3], name)
+        if once:
+            fine = lab.finished(scene + ["-ventilator_ramp", 0, "-ts_max_time", 0.3, "-ts_dt", 0.025], f"{name}, Δt halved")
+            if fine:
+                lab.within(f"{name}: V after 0.3 s beside that of half the step (ml)", once.signals()["volume_ml"][-1],
+                           fine.signals()["volume_ml"][-1], 0.02)
+
+
+@case("Square flow of 500 ml in 50 ms")
+def flood(lab):
+    """10 l/s through an airway of 7 cm² into a lung of 1350 ml, in one step or in ten: twenty times the usual flow."""
+    for law in ["yoshihara"] if lab.small else ["ma", "birzle", "yoshihara"]:
+        for dt in [0.05] if lab.small or law != "yoshihara" else [0.05, 0.005]:
+            mesh = ["-dm_plex_filename", pulmo.mesh("cube_lung.msh"), "-mesh_scale", 11] if lab.small else pulmo.LUNG
+            run = lab.finished(pulmo.DIRECT + pulmo.VCV + mesh + [
+                "-tissue", law, "-ventilator_inspiration", 0.05, "-ts_dt", dt, "-ts_max_time", 0.1, "-lumen_pressure"],
+                f"{law}, Δt {dt} s")
+            if run:
+                rows = run.signals()
+                at = int(np.abs(rows["time_s"] - 0.05).argmin())
+                lab.within(f"volume in after 50 ms, {law}, Δt {dt} s (ml)", rows["volume_ml"][at], 500, 1e-9)
+
+
+@case("Time steps from 10⁻⁵ to 1 s")
+def steps(lab):
+    """The mass balance is ill conditioned for tiny steps (the flow hides behind storage) and stiff for long ones."""
+    lung = pulmo.DIRECT + pulmo.PCV + pulmo.CUBE + ["-tissue", "yoshihara", "-airflow_permeability", 30, "-ventilator_ramp", 0.01]
+    ladder = [1e-4, 5e-4, 2.5e-3] if lab.small else [1e-5, 1e-4, 1e-3]
+    volumes = []
+    for dt in ladder:
+        run = lab.finished(lung + ["-ts_dt", dt, "-ts_max_time", 0.01, "-output_fields_every", 1], f"Δt {dt} s")
+        volumes.append(run.signals()["volume_ml"][-1] if run else np.nan)
+    ratio = ladder[1] / ladder[0]
+    a, b, c = volumes
+    order = np.log((c - b) / (b - a)) / np.log(ratio)
+    lab.within("order in Δt of V(10 ms), backward Euler's", order, 1, 0.15)
+    still = lab.finished(lung + ["-airflow", "off", "-ventilator_ramp", 0.5, "-ts_max_time", 1], "at rest")
+    for dt in (0.05, 1):
+        run = lab.finished(lung + ["-ts_dt", dt, "-ventilator_inspiration", 20, "-ts_max_time", 20], f"Δt {dt} s to rest")
+        if run and still:
+            lab.within(f"V after 20 s at Δt {dt} s beside that at rest (ml)", run.signals()["volume_ml"][-1],
+                       still.signals()["volume_ml"][-1], 1e-6)
+
+
+@case("Springs: K_s = 0 and K_s = 10⁴ kPa/mm")
+def springs(lab):
+    """Without springs six rigid motions are free; with springs of 10⁵ times the usual stiffness the surface rows outweigh the
+    tissue's by six decades."""
+    lung = pulmo.LUNG if not lab.small else pulmo.CUBE
+    refused = lab.run(pulmo.DIRECT + pulmo.PCV + lung + ["-chest_wall_stiffness", 0])
+    lab.true("K_s = 0 with nothing else to hold the lung is refused in a sentence",
+             not refused.finished and "nothing holds the lung" in refused.err)
+    still = pulmo.DIRECT + pulmo.PCV + lung + ["-tissue", "yoshihara", "-airflow", "off", "-ventilator_ramp", 1,
+                                               "-ventilator_pip", 6, "-ts_max_time", 1]
+    free = lab.finished(still + ["-chest_wall", "off"] + pulmo.PINS, "K_s = 0 on pins")
+    if free:
+        J = inflated("yoshihara", 6, 1, 2)
+        V0 = free.json()["reference_volume_ml"]
+        lab.within("V on pins (ml)", free.signals()["volume_ml"][-1], (J - 1) * V0, 1e-8)
+    volumes = {}
+    for K in (1e2, 1e3, 1e4):
+        run = lab.finished(still + ["-chest_wall_stiffness", K], f"K_s {K:g}")
+        if run:
+            volumes[K] = run.signals()["volume_ml"][-1]
+            area = run.json()["surface_area_mm2"]
+    if len(volumes) == 3:
+        lab.below("V(K_s = 10⁴) over a rigid piston's p A/K_s", volumes[1e4] / (6 * pulmo.KPA_PER_CMH2O * area / 1e4 / 1000), 1)
+        a, b, c = (K * volume for K, volume in volumes.items())
+        lab.within("K_s V tends to a limit as 1/K_s: ratio of its changes over two decades", (b - a) / (c - b), 10, 0.3)
+    iterative = lab.finished(ITERATIVE + still[2:] + ["-chest_wall_stiffness", 1e4, "-airflow", "on"], "K_s 10⁴, iterative.opts")
+    if iterative:
+        numbers = iterative.json()
+        lab.below("Krylov per Newton iteration", numbers["krylov_iterations"] / numbers["newton_iterations"], 30)
+
+
+def breath(name, size, more):
+    """VCV and PCV options of a lung `size` times as large, all else scaled so that the waveforms are the same."""
+    common = ["-airflow_permeability", 1e4 * size**2, "-chest_wall_stiffness", 0.08 / size, "-ts_max_time", 0.3] + more
+    if name == "vcv":
+        return pulmo.VCV + ["-ventilator_tidal_volume", 250 * size**3] + common
+    return pulmo.PCV + common
+
+
+@case("The same lung as a mouse's (0.1), three times as large, and in metres")
+def scales(lab):
+    """Dimensional slips and absolute tolerances show: with k ∝ size² and K_s ∝ 1/size the problem is the same, so are
+    iteration counts, pressures, J, and volumes over size³."""
+    mesh = "cube_lung.msh" if lab.small else "lung_test.msh"
+    base = 10 if lab.small else 1  # the cube as a litre
+    for kind in ("pcv", "vcv"):
+        for solver, file in (("direct", pulmo.DIRECT), ("iterative", ITERATIVE)):
+            def run(size, mesh_options):
+                return lab.finished(file + mesh_options + breath(kind, size, []), f"{kind}, {solver}, size {size}")
+            one = run(1, meshes.scaled(mesh, base))
+            if one is None:
+                continue
+            reference, counts = one.signals(), one.json()
+            for size, options in ((0.1, meshes.scaled(mesh, 0.1 * base)), (3, meshes.scaled(mesh, 3 * base)),
+                                  (1, meshes.scaled(mesh, base / 1000) + ["-mesh_scale", 1000])):
+                name = "in metres" if size == 1 else f"× {size}"
+                other = run(size, options)
+                if other is None:
+                    continue
+                rows, numbers = other.signals(), other.json()
+                same = len(rows["time_s"]) == len(reference["time_s"])
+                worst = max(np.abs(rows[c] / scale - reference[c]).max() / np.abs(reference[c]).max() for c, scale in (
+                    ("airway_pressure_cmH2O", 1), ("volume_ml", size**3), ("min_J", 1))) if same else np.inf
+                lab.below(f"{kind}, {solver}, {name}: largest relative difference of P, V, J", worst,
+                          1e-10 if solver == "direct" else 1e-6)
+                # rounding may tip one Newton step at the tolerance
+                spare = abs(numbers["newton_iterations"] - counts["newton_iterations"])
+                spare_krylov = abs(numbers["krylov_iterations"] - counts["krylov_iterations"])
+                lab.demand(f"{kind}, {solver}, {name}: Newton and Krylov iterations",
+                           f"{numbers['newton_iterations']}, {numbers['krylov_iterations']}",
+                           f"{counts['newton_iterations']}, {counts['krylov_iterations']}", spare == 0 and spare_krylov == 0)
+
+
+@case("Two lungs of very different stiffness on one windpipe")
+def two_lungs(lab):
+    """With springs a million times apart the stiff lung is nearly rigid: the one airway pressure is fixed by the soft lung
+    alone, and a bordered Newton step with a poor pressure would push all the gas into the wrong one."""
+    K = {"stiff": 1e2, "soft": 1e-4}
+    files = {names: airway_test.bodies(*names) for names in (("stiff", "soft"), ("stiff",), ("soft",))}
+
+    def scene(*names):
+        held = ["-chest_wall_surfaces", ",".join(names)]
+        for name in names:
+            held += [f"-chest_wall_stiffness_{name}", K[name]]
+        return pulmo.TIGHT + pulmo.SCENE + held + files[names] + ["-airflow_permeability", 2e3]
+
+    both = lab.finished(scene("stiff", "soft") + airway_test.TwoBodies.FLOW + pulmo.COMMON, "common pressure")
+    if both is None:
+        return
+    rows = both.signals()
+    lab.within("volume in (ml)", rows["volume_ml"].max(), 40, 1e-9)
+    alone = {name: lab.finished(scene(name) + airway_test.replay(rows), f"{name} alone") for name in K}
+    if all(alone.values()):
+        volume = {name: run.signals()["volume_ml"] for name, run in alone.items()}
+        lab.below("each alone under the pressure found: sum of volumes − both (ml)",
+                  np.abs(volume["stiff"] + volume["soft"] - rows["volume_ml"]).max(), 4e-8)
+        strain = {name: v.max() / {"stiff": 125, "soft": 64}[name] for name, v in volume.items()}
+        lab.above("strain of the soft lung over that of the stiff", strain["soft"] / strain["stiff"], 1.5)
+    for name, options in {} if lab.small else {"uniform": pulmo.UNIFORM, "iterative": pulmo.COMMON}.items():
+        more = ITERATIVE[1:] if name == "iterative" else []
+        run = lab.finished(scene("stiff", "soft") + (["-options_file"] + more if more else []) +
+                           airway_test.TwoBodies.FLOW + options, name)
+        if run:
+            lab.within(f"volume in, {name} (ml)", run.signals()["volume_ml"].max(), 40, 1e-9)
+
+
+@case("A thousand breaths")
+def breaths(lab):
+    """What leaks or drifts a little per breath adds up: volume, memory, the clock of the phases."""
+    count = 30 if lab.small else 1000
+    scene = REUSE + pulmo.SCENE + pulmo.CUBE + ["-airflow_permeability", 1e3, "-ts_dt", 0.5, "-output_fields_every", 1e9] + \
+        pulmo.programme(f"repeat {count}\n inspiration 0.5 pressure 6\n expiration 2 pressure 0\nend\n")
+    samples, done = [], threading.Event()
+
+    def watch():
+        """Resident memory of the child of this process that is pulmo."""
+        while not done.wait(0.05):
+            pids = " ".join(path.read_text() for path in Path("/proc/self/task").glob("*/children")).split()
+            if pids:
+                samples.append(max(resident(pid) for pid in pids))
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    try:
+        run = lab.finished(scene, f"{count} breaths", timeout=1200)
+    finally:
+        done.set()
+        watcher.join()
+    if run is None:
+        return
+    rows = run.signals()
+    ends = np.array([i for i, t in enumerate(rows["time_s"]) if i and abs(t / 2.5 - round(t / 2.5)) < 1e-9])
+    lab.demand("breaths that ended on time", len(ends), str(count), len(ends) == count)
+    V0 = run.json()["reference_volume_ml"]
+    volume = rows["volume_ml"][ends]
+    lab.below("drift of the end-expiratory volume over V0", np.abs(volume[5:] - volume[5]).max() / V0, 1e-8)
+    peaks = rows["volume_ml"][[i - 4 for i in ends]]
+    lab.below("drift of the peak volume over V0", np.abs(peaks[5:] - peaks[5]).max() / V0, 1e-8)
+    lab.below("mass balance over V0, per step", run.json()["mass_balance_error_ml"] / V0 / run.json()["steps"], 1e-8)
+    lab.below("energy balance, residual over work", run.json()["energy_j"]["residual_relative"], 1e-7)
+    sizes = np.array(samples)
+    if not lab.small and len(sizes) > 50:
+        settled = sizes[len(sizes) // 10:]
+        steps_taken = run.json()["steps"] * 0.9
+        lab.curves["memory"] = [np.linspace(0, count, len(sizes)).tolist()[::max(1, len(sizes) // 200)],
+                                (sizes / 1e6).tolist()[::max(1, len(sizes) // 200)]]
+        # each step adds a row of the signals, of the energy and of each region: some 0.5 kB
+        lab.below("memory gained per step after the first tenth (kB)", (settled[-3:].mean() - settled[:3].mean()) / steps_taken / 1e3, 1)
