@@ -171,7 +171,8 @@ PetscErrorCode run(const Registry &registry, bool &finished)
   options.group("effects", "ledger");
   PetscCall(options.flag("view", "print effects, fields, terms, blocks and seconds at the end", view_effects));
   options.group("energy", "energy balance");
-  PetscCall(options.flag("audit", "follow the energy balance over the steps (energy.csv; backward Euler)", audit_energy));
+  PetscCall(
+      options.flag("audit", "follow the energy balance over the steps (energy.csv; backward Euler)", audit_energy));
   PetscCall(PetscOptionsHasHelp(nullptr, &help));
   PetscCall(PetscOptionsHasName(nullptr, nullptr, "-dm_plex_filename", &has_mesh));
   if (help) PetscCall(options.print_help());
