@@ -108,6 +108,7 @@ PetscErrorCode EnergyAudit::integrate(const Part &part, const StepReport &step, 
 
   PetscFunctionBeginUser;
   step_now.dt = step_before.dt = dt;
+  step_now.load = model_.load();
   step_now.gas_pressure = step.row.pressure * units::kPa_per_cmH2O;
   step_before.gas_pressure = gas_pressure_;
   PetscCall(DMGetDS(model_.dm(), &ds));

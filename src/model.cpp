@@ -412,7 +412,7 @@ PetscErrorCode Model::set_step(PetscReal dt, PetscReal airway_pressure, PetscRea
   const PetscReal L = mesh_->length();
 
   PetscFunctionBeginUser;
-  step_ = {dt, airway_pressure, airway_area_ > 0 ? -airway_flow / airway_area_ : 0};
+  step_ = {dt, airway_pressure, airway_area_ > 0 ? -airway_flow / airway_area_ : 0, step_.load};
   row_scale_[displacement] = 1 / (modulus_ * L * L);
   if (row_scale_.size() > pressure) row_scale_[pressure] = dt / (L * L * L);
   PetscCall(pack_constants());

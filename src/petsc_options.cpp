@@ -21,7 +21,7 @@ constexpr double infinity = std::numeric_limits<double>::infinity();
 
 const std::vector<Number> &numbers()
 {
-  static const Range share{0, 1, true}, count = Range::between(1, 1e9), lag = Range::between(-2, 1e9);
+  static const Range share = Range::between(0, 0.99), count = Range::between(1, 1e9), lag = Range::between(-2, 1e9);
   static const std::vector<Number> list{
       {"-ts_dt", "s", Range::between(least_step, infinity), false},
       {"-ts_max_time", "s", Range::positive(), false},

@@ -49,119 +49,7 @@ private:
   PetscLogDouble start_ = 0;
 };
 
-PetscErrorCode ifunction(TS, PetscReal t, Vec X, Vec Xdot, Vec F, void *simulation)
-{
-  return static_cast<Simulation *>(simulation)->residual(t, X, Xdot, F);
-}
-
-PetscErrorCode ijacobian(TS, PetscReal t, Vec X, Vec Xdot, PetscReal shift, Mat A, Mat P, void *simulation)
-{
-  PetscFunctionBeginUser;
-  PetscCall(static_cast<Simulation *>(simulation)->jacobian(t, X, Xdot, shift, P));
-  if (A != P) { // -snes_mf_operator
-    PetscCall(MatAssemblyBegin(A, MAT_FINAL_ASSEMBLY));
-    PetscCall(MatAssemblyEnd(A, MAT_FINAL_ASSEMBLY));
-  }
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode simulation_of(TS ts, Simulation **simulation)
-{
-  PetscFunctionBeginUser;
-  PetscCall(TSGetApplicationContext(ts, simulation));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode pre_stage(TS ts, PetscReal t)
-{
-  Simulation *simulation;
-
-  PetscFunctionBeginUser;
-  PetscCall(simulation_of(ts, &simulation));
-  PetscCall(simulation->before_stage(t));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode initial_guess(SNES snes, Vec X, void *simulation)
-{
-  return static_cast<Simulation *>(simulation)->guess(snes, X);
-}
-
-PetscErrorCode newton_step(SNESLineSearch search, Vec X, Vec Y, PetscBool *changed, void *simulation)
-{
-  SNES snes;
-
-  PetscFunctionBeginUser;
-  PetscCall(SNESLineSearchGetSNES(search, &snes));
-  PetscCall(static_cast<Simulation *>(simulation)->border(snes, X, Y));
-  *changed = PETSC_TRUE;
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode newton_converged(SNES snes, PetscInt it, PetscReal xnorm, PetscReal ynorm, PetscReal fnorm,
-                                SNESConvergedReason *reason, void *simulation)
-{
-  return static_cast<Simulation *>(simulation)->converged(snes, it, xnorm, ynorm, fnorm, reason);
-}
-
-PetscErrorCode post_stage(TS ts, PetscReal, PetscInt, Vec *)
-{
-  Simulation *simulation;
-
-  PetscFunctionBeginUser;
-  PetscCall(simulation_of(ts, &simulation));
-  PetscCall(simulation->after_stage());
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode post_step(TS ts)
-{
-  Simulation *simulation;
-
-  PetscFunctionBeginUser;
-  PetscCall(simulation_of(ts, &simulation));
-  PetscCall(simulation->after_step());
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode check_stage(TSAdapt, TS ts, PetscReal t, Vec X, PetscBool *accept)
-{
-  Simulation *simulation;
-
-  PetscFunctionBeginUser;
-  PetscCall(simulation_of(ts, &simulation));
-  PetscCall(simulation->accept_stage(t, X, accept));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode choose_step(TSAdapt adapt, TS ts, PetscReal h, PetscInt *next_scheme, PetscReal *next_h,
-                           PetscBool *accept, PetscReal *wlte, PetscReal *wltea, PetscReal *wlter)
-{
-  Simulation *simulation;
-
-  PetscFunctionBeginUser;
-  PetscCall(simulation_of(ts, &simulation));
-  *next_scheme = 0;
-  *next_h = simulation->next_step(ts->ptime, h, *adapt, *accept);
-  *wlte = *wltea = *wlter = -1; // no error is estimated
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode create_step_control(TSAdapt adapt)
-{
-  PetscFunctionBeginUser;
-  adapt->ops->choose = choose_step;
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
 } // namespace
-
-PetscErrorCode register_step_control()
-{
-  PetscFunctionBeginUser;
-  PetscCall(TSAdaptRegister("pulmo", create_step_control));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
 
 PetscErrorCode Simulation::declare(Options &options)
 {
@@ -186,116 +74,6 @@ PetscErrorCode Simulation::setup()
   PetscCall(create_solver());
   phases_ = phases();
   end_ = phases_.back().end;
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode Simulation::create_solver()
-{
-  const MPI_Comm comm = options_.comm();
-  SNES snes;
-  KSP ksp;
-  PC pc;
-  TSAdapt adapt;
-  PetscReal max_time;
-  PetscInt max_steps;
-  PetscBool own_control, has_pc, is_fieldsplit = PETSC_FALSE, is_lu = PETSC_FALSE;
-  char pc_type[64] = "";
-
-  PetscFunctionBeginUser;
-  PetscCall(PetscOptionsGetString(nullptr, nullptr, "-pc_type", pc_type, sizeof(pc_type), &has_pc));
-  PulmoUserCheck(
-      has_pc, comm,
-      "no linear solver: give a solver file, e.g. -options_file petsc_options/solvers/direct.opts (or -pc_type)");
-  PetscCall(PetscStrcmp(pc_type, PCFIELDSPLIT, &is_fieldsplit));
-  PetscCall(PetscStrcmp(pc_type, PCLU, &is_lu));
-  if (!is_lu) PetscCall(attach_rigid_body_modes(model_.dm())); // a factorisation has no use for them
-
-  PetscCall(TSCreate(comm, ts_.out()));
-  PetscCall(TSSetDM(ts_, model_.dm()));
-  PetscCall(TSSetApplicationContext(ts_, this));
-  PetscCall(TSSetIFunction(ts_, nullptr, ifunction, this));
-  PetscCall(model_.create_matrix(matrix_.out()));
-  PetscCall(TSSetIJacobian(ts_, matrix_, matrix_, ijacobian, this));
-  PetscCall(TSSetProblemType(ts_, TS_NONLINEAR));
-  PetscCall(TSSetType(ts_, TSBEULER));
-  PetscCall(TSSetTimeStep(ts_, wanted_dt_));
-  PetscCall(TSSetMaxTime(ts_, PETSC_MAX_REAL));
-  PetscCall(TSSetMaxSteps(ts_, PETSC_MAX_INT));
-  PetscCall(TSSetExactFinalTime(ts_, TS_EXACTFINALTIME_MATCHSTEP));
-  PetscCall(TSSetMaxSNESFailures(ts_, -1));
-  PetscCall(TSSetMaxStepRejections(ts_, -1)); // reject() knows when to give up
-  PetscCall(TSSetErrorIfStepFails(ts_, PETSC_FALSE));
-  PetscCall(TSSetPreStage(ts_, pre_stage));
-  PetscCall(TSSetPostStage(ts_, post_stage));
-  PetscCall(TSSetPostStep(ts_, post_step));
-  PetscCall(TSGetAdapt(ts_, &adapt));
-  PetscCall(TSAdaptSetType(adapt, "pulmo"));
-  PetscCall(TSAdaptSetClip(adapt, 0.1, 2.0));
-  PetscCall(TSAdaptSetCheckStage(adapt, check_stage));
-  PetscCall(TSGetSNES(ts_, &snes));
-  PetscCall(SNESGetKSP(snes, &ksp));
-  if (is_fieldsplit && !scene_.facts().airflow) {
-    // one field: what a solver file says of the displacement split preconditions the whole
-    PetscCall(KSPGetPC(ksp, &pc));
-    PetscCall(PCSetOptionsPrefix(pc, "fieldsplit_displacement_"));
-  }
-  PetscCall(SNESSetComputeInitialGuess(snes, initial_guess, this));
-  PetscCall(TSSetFromOptions(ts_));
-  PetscCall(offer_fixed_stress(ksp));
-  PetscCall(lagging_.setup(snes));
-  if (lagging_.in_use() || predictor_.in_use() ||
-      (scene_.facts().ventilator && scene_.facts().ventilator->prescribes_flow()))
-    PetscCall(SNESSetConvergenceTest(snes, newton_converged, this, nullptr));
-  if (scene_.facts().common_pressure()) {
-    SNESLineSearch search;
-    PetscBool newton;
-    PetscCall(PetscObjectTypeCompare((PetscObject)snes, SNESNEWTONLS, &newton));
-    PulmoUserCheck(newton, comm,
-                   "-snes_type: an airway pressure that is an unknown of its own needs Newton with line search; use "
-                   "-snes_type newtonls");
-    for (const char *option : {"-snes_mf", "-snes_mf_operator", "-snes_fd", "-snes_fd_color"}) {
-      PetscBool given = PETSC_FALSE;
-      PetscCall(PetscOptionsGetBool(nullptr, nullptr, option, &given, nullptr));
-      PulmoUserCheck(!given, comm,
-                     "%s: an airway pressure that is an unknown of its own needs the assembled Jacobian; "
-                     "leave the option out",
-                     option);
-    }
-    PetscCall(SNESGetLineSearch(snes, &search));
-    PetscCall(SNESLineSearchSetPreCheck(search, newton_step, this));
-    PetscCall(VecDuplicate(state_, border_x_.out()));
-    PetscCall(VecDuplicate(state_, border_b_.out()));
-    PetscCall(VecDuplicate(state_, border_z_.out()));
-    PetscCall(VecDuplicate(local_, border_y_.out()));
-  }
-  PetscCall(TSGetTimeStep(ts_, &wanted_dt_));
-  PulmoUserCheck(wanted_dt_ > 0, comm, "-ts_dt %g s must be positive", (double)wanted_dt_);
-  PetscCall(TSGetMaxTime(ts_, &max_time));
-  PetscCall(TSGetMaxSteps(ts_, &max_steps));
-  PulmoUserCheck(max_steps == PETSC_MAX_INT, comm, "-ts_max_steps would cut a phase short; use -ts_max_time");
-  PetscCall(PetscObjectTypeCompare((PetscObject)adapt, "pulmo", &own_control));
-  PulmoUserCheck(own_control, comm, "-ts_adapt_type: pulmo cuts, regrows and lands steps itself; leave the option out");
-  PulmoUserCheck(max_time > 0, comm, "-ts_max_time %g s leaves nothing to run; it must be positive", (double)max_time);
-  PetscCall(scheme_.setup(ts_, local_));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-/// Gives `-pc_fieldsplit_schur_precondition user` its matrix.
-PetscErrorCode Simulation::offer_fixed_stress(KSP ksp)
-{
-  PC pc;
-  PetscBool fieldsplit;
-  PCFieldSplitSchurPreType type;
-  Mat none;
-
-  PetscFunctionBeginUser;
-  PetscCall(KSPGetPC(ksp, &pc));
-  PetscCall(PetscObjectTypeCompare((PetscObject)pc, PCFIELDSPLIT, &fieldsplit));
-  if (!fieldsplit || !scene_.facts().airflow) PetscFunctionReturn(PETSC_SUCCESS);
-  PetscCall(PCFieldSplitGetSchurPre(pc, &type, &none));
-  if (type != PC_FIELDSPLIT_SCHUR_PRE_USER) PetscFunctionReturn(PETSC_SUCCESS);
-  PetscCall(model_.use_fixed_stress());
-  PetscCall(PCFieldSplitSetSchurPre(pc, type, model_.fixed_stress()));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -430,6 +208,7 @@ PetscErrorCode Simulation::before_stage(PetscReal t)
   PetscCall(TSGetTimeStep(ts_, &dt));
   PetscCall(scheme_.begin_stage(t, dt));
   airway_.begin_stage(t, begin + dt, scheme_);
+  model_.set_load(std::min<PetscReal>(1, (begin + dt) / std::min(wanted_dt_, end_)));
   extra_newton_ = 0;
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -803,8 +582,9 @@ std::string Simulation::failure_text() const
             "another -tissue; the law may have no equilibrium at this pressure.";
   else
     text << "another file of petsc_options/solvers, a smaller -ts_dt, a larger -snes_max_it, a slower rise of pressure "
-            "or flow; -snes_monitor and -ksp_monitor show where it stalls; the law may have no equilibrium at this "
-            "pressure.";
+            "or flow, -snes_linesearch_type basic where volume is far stiffer than shape; -snes_monitor and "
+            "-ksp_monitor "
+            "show where it stalls; the law may have no equilibrium at this pressure.";
   return text.str();
 }
 

@@ -29,6 +29,9 @@ public:
   /// Tells the kernels the step at hand: its size (s), the pressure held at the airway (kPa) and the flow into the lung
   /// that is prescribed while none is held (mm^3/s).
   PetscErrorCode set_step(PetscReal dt, PetscReal airway_pressure, PetscReal airway_flow = 0);
+  /// Share of the dead loads that is there from the next set_step() on.
+  void set_load(PetscReal load) { step_.load = load; }
+  PetscReal load() const { return step_.load; }
   /// Whether the pressure is held on the surfaces open to the ventilator (so at the start), or free. Held nodes keep
   /// their rows: identity in the Jacobian, zero in the residual that close_rows() leaves.
   void hold_airway(bool held) { airway_held_ = held; }
@@ -115,7 +118,7 @@ private:
   bool closes_rows_ = false, airway_held_ = true;
   PetscInt carrier_ = -1; ///< global dof, -1 on ranks that do not own it
   PetscMPIInt carrier_rank_ = 0;
-  Step step_{1, 0, 0};
+  Step step_{1, 0, 0, 1};
   PetscReal modulus_ = 1;
   std::vector<PetscReal> row_scale_;
   PetscInt quadrature_degree_ = 3;

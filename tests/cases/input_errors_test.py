@@ -426,7 +426,8 @@ def table(m):
             lung + ["-airflow", "off", "-ventilator", "vcv", "-petscfe_type", "basic"], ["-petscfe_type basic", "pulmo"]),
         # solver and time
         "no solver file": (pulmo.PCV + ["-dm_plex_filename", m["good"]], ["petsc_options/solvers/direct.opts", "-pc_type"]),
-        "time integrator": (good + ["-ts_type", "bdf"], ["-ts_type", "beuler"]),
+        "time integrator": (good + ["-ts_type", "cn"], ["-ts_type", "beuler"]),
+        "order of BDF": (good + ["-ts_type", "bdf", "-ts_bdf_order", "3"], ["-ts_bdf_order 3", "order 2"]),
         "step backwards": (good + ["-ts_dt", "-0.1"], ["-ts_dt", "-0.1", "out of range", ">="]),
         "a word for a step": (good + ["-ts_dt", "short"], ["-ts_dt", "number", "short"]),
         "a word for a number of PETSc's": (good + ["-snes_rtol", "tiny"], ["-snes_rtol", "number", "tiny"]),
@@ -438,7 +439,7 @@ def table(m):
         "an end that is no number": (good + ["-ts_max_time", "nan"], ["-ts_max_time", "number", "'nan'"]),
         "no Newton step": (good + ["-snes_max_it", "-3"], ["-snes_max_it", "-3", "out of range"]),
         "half a Newton step": (good + ["-snes_max_it", "2.5"], ["-snes_max_it", "whole number", "'2.5'"]),
-        "a tolerance above one": (good + ["-ksp_rtol", "7"], ["-ksp_rtol", "7", "out of range", "0 < value < 1"]),
+        "a tolerance above one": (good + ["-ksp_rtol", "7"], ["-ksp_rtol", "7", "out of range", "0.99"]),
         "a negative refinement": (good + ["-dm_refine", "-1"], ["-dm_refine", "-1", "out of range"]),
         "a lag of nothing": (good + ["-snes_lag_jacobian", "0"], ["-snes_lag_jacobian", "0", "out of range"]),
         "no number for a number of PETSc's": (good + ["-snes_linesearch_damping", "nan"],

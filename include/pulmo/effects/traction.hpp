@@ -1,5 +1,6 @@
 /// @file
-/// Effect `traction`: dead load (kPa per reference area, fixed direction) on named surfaces, held from t = 0 on.
+/// Effect `traction`: dead load (kPa per reference area, fixed direction) on named surfaces, held from t = 0 on. Where the
+/// first step has to be cut the load is cut with it.
 #pragma once
 
 #include "pulmo/effect.hpp"
@@ -20,9 +21,9 @@ struct TractionKernels {
 
   /// f0 = -T.
   template <std::size_t I>
-  static void load(const Point &, const Parameters &k, PetscScalar f0[])
+  static void load(const Point &point, const Parameters &k, PetscScalar f0[])
   {
-    for (int i = 0; i < 3; ++i) f0[i] -= k.value[I][i];
+    for (int i = 0; i < 3; ++i) f0[i] -= point.step.load * k.value[I][i];
   }
 
   /// Work of the load in a step: T . du, kPa mm.
@@ -30,7 +31,7 @@ struct TractionKernels {
   static PetscScalar work(const Point &now, const Point &before, const Parameters &k)
   {
     PetscScalar sum = 0;
-    for (int i = 0; i < 3; ++i) sum += k.value[I][i] * (now.u[i] - before.u[i]);
+    for (int i = 0; i < 3; ++i) sum += now.step.load * k.value[I][i] * (now.u[i] - before.u[i]);
     return sum;
   }
 
