@@ -60,8 +60,8 @@ void Airway::begin_stage(PetscReal t, PetscReal step_end, const TimeScheme &sche
 {
   slope_ = scheme.slope();
   past_flow_ = scheme.past_flow();
-  limited_ = limited_before_ || retake_; // a cut step may stay below the limit
-  retake_ = false;
+  limited_ = limited_before_ || retake_;
+  retake_ = retake_ && scheme.half_step(); // the whole step that follows belongs to the same attempt
   set_mode();
   if (control() == Control::flow)
     volume_target_ = volume_begin_ + phase_.delivered(t);
@@ -125,7 +125,8 @@ PetscErrorCode Airway::pressure(Vec local, PetscReal &pressure)
 
 bool Airway::limit(PetscReal flow)
 {
-  retake_ = phase_.limit && !limited_ && ventilator_pressure(flow) > *phase_.limit;
+  if (limited_) return false;
+  retake_ = phase_.limit && ventilator_pressure(flow) > *phase_.limit;
   return retake_;
 }
 

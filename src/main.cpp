@@ -18,9 +18,14 @@ int main(int argc, char **argv)
 
   if (MPI_Init(&argc, &argv) != MPI_SUCCESS) return 1;
   MPI_Comm_rank(MPI_COMM_WORLD, &rank);
-  const std::string fault = pulmo::command_line_fault({argv + 1, argv + argc});
-  if (!fault.empty()) {
-    if (rank == 0) std::fprintf(stderr, "pulmo: error: %s\n", fault.c_str());
+  int faulty = 0;
+  if (rank == 0) { // option files may be on its disk alone: PETSc reads them there, too
+    const std::string fault = pulmo::command_line_fault({argv + 1, argv + argc});
+    faulty = !fault.empty();
+    if (faulty) std::fprintf(stderr, "pulmo: error: %s\n", fault.c_str());
+  }
+  MPI_Bcast(&faulty, 1, MPI_INT, 0, MPI_COMM_WORLD);
+  if (faulty) {
     MPI_Finalize();
     return 1;
   }

@@ -283,7 +283,8 @@ std::string Options::misspelt(const std::string &name) const
   const std::string guess = nearest(name, std::min<std::size_t>(2, (name.size() - 1) / letters_per_slip));
   const auto same = [&](const Declared &d) { return d.name == guess; };
   if (std::any_of(declared_.begin(), declared_.end(), same) ||
-      (guess != name && std::find(std::begin(essential), std::end(essential), guess) != std::end(essential)))
+      (guess != name && guess[1] == name[1] &&
+       std::find(std::begin(essential), std::end(essential), guess) != std::end(essential)))
     return guess;
   const std::string tail = "_" + name.substr(1); // -pip for -ventilator_pip
   for (const Declared &d : declared_)

@@ -90,8 +90,7 @@ PetscErrorCode Simulation::persist(Archive &archive)
     PetscCall(DMLocalToGlobal(model_.dm(), before_, INSERT_VALUES, state_));
     PetscCall(airway_.restore(state_));
   }
-  if (archive.reading())
-    PetscCall(scheme_.begin(model_, accepted_.time, accepted_.volume * units::mm3_per_ml, before_));
+  PetscCall(scheme_.persist(archive, model_, accepted_.time, accepted_.volume * units::mm3_per_ml, before_));
   PetscCall(step_control_.persist(archive));
   PetscCall(predictor_.persist(archive, state_));
   for (Observer *observer : observers_) PetscCall(observer->persist(archive, before_));
@@ -109,8 +108,9 @@ PetscErrorCode Simulation::resume(const Archive &archive, PetscInt index, PetscR
   PetscCall(archive.check(index >= 0 && index < static_cast<PetscInt>(phases_.size()), "phase"));
   phase_ = &phases_[static_cast<std::size_t>(index)];
   airway_.begin_phase(*phase_, 0, 0);
-  if (wanted_dt != wanted_dt_) dt_ = wanted_dt_;
-  if (wanted_dt != wanted_dt_ || phase_end != phase_->end) next_dt_ = landing(accepted_.time);
+  const bool new_dt = wanted_dt != wanted_dt_ || (!step_control_.in_use() && dt_ > wanted_dt_);
+  if (new_dt) dt_ = wanted_dt_;
+  if (new_dt || phase_end != phase_->end) next_dt_ = landing(accepted_.time);
   resumed_ = true;
   PetscFunctionReturn(PETSC_SUCCESS);
 }

@@ -192,7 +192,13 @@ PetscErrorCode run(const Registry &registry, bool &finished)
   Sampling sampling;
   RegionAudit regions(scene, run.model(), sampling);
   EnergyAudit energy(scene, run.model(), sampling);
-  if (simulation.scheme().multistep()) audit_energy = false; // the balance is that of backward Euler
+  if (simulation.scheme().multistep()) {
+    PetscBool given;
+    PetscCall(PetscOptionsHasName(nullptr, nullptr, "-energy_audit", &given));
+    PulmoUserCheck(!given || !audit_energy, comm,
+                   "-energy_audit: the balance is that of backward Euler; leave the option out with -ts_type bdf");
+    audit_energy = false;
+  }
   const Audits audits{regions, audit_energy ? &energy : nullptr};
   PetscCall(sampling.setup(run.model()));
   PetscCall(regions.setup());

@@ -32,6 +32,33 @@ constexpr int max_extra_newton = 3;
 /// Failed attempts that are remembered.
 constexpr std::size_t max_failures = 12;
 
+/// At a limit point volume follows pressure more steeply than on the way there, by this factor at least: dV/dP goes to
+/// infinity, and steps end far closer to it than this asks for.
+constexpr double limit_steepness = 5;
+
+/// No cell that has less than this J is well.
+constexpr double well_formed = 0.5;
+
+/// Says so if the last rows, of a phase that prescribes pressure, end at a limit point; empty if not.
+std::string limit_point(const std::vector<SignalRow> &rows)
+{
+  std::ostringstream text;
+  std::size_t first = rows.size() - 1;
+  while (first > 0 && rows[first - 1].phase == rows.back().phase && rows[first - 1].breath == rows.back().breath)
+    --first;
+  if (first + 2 >= rows.size()) return "";
+  const SignalRow &begin = rows[first], &before = rows[rows.size() - 2], &end = rows.back();
+  const double last = (end.volume - before.volume) / (end.pressure - before.pressure),
+               way = (before.volume - begin.volume) / (before.pressure - begin.pressure);
+  if (!(end.pressure > before.pressure && before.pressure > begin.pressure && last > limit_steepness * way)) return "";
+  text.precision(4);
+  text << " Volume follows pressure ever more steeply, by " << last << " ml/cmH2O in the last step and " << way
+       << " on the way there: a limit point. There is no equilibrium above ";
+  text.precision(6);
+  text << end.pressure << " cmH2O.";
+  return text.str();
+}
+
 class Stopwatch {
 public:
   explicit Stopwatch(double &seconds) : seconds_(seconds) { (void)PetscTime(&start_); }
@@ -184,7 +211,7 @@ PetscErrorCode Simulation::run(bool &finished)
     PetscCall(TSSetTime(ts_, within ? accepted_.time : phase.begin));
     PetscCall(TSSetMaxTime(ts_, phase.end));
     PetscCall(TSSetTimeStep(ts_, next_dt_));
-    PetscCall(TSRestartStep(ts_)); // no scheme may look back beyond the kink
+    PetscCall(scheme_.begin_solve(static_cast<PetscInt>(rows_.size()) - 1));
     PetscCall(TSSolve(ts_, state_));
     PetscCall(TSGetConvergedReason(ts_, &reason));
     if (reason < 0 || stopped_) {
@@ -337,15 +364,13 @@ PetscErrorCode Simulation::converged(SNES snes, PetscInt it, PetscReal xnorm, Pe
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Simulation::jacobian(PetscReal t, Vec X, Vec Xdot, PetscReal shift, Mat A)
+PetscErrorCode Simulation::jacobian(PetscReal t, Vec X, Vec Xdot, Mat A)
 {
   const Stopwatch clock(seconds_.jacobian);
 
   PetscFunctionBeginUser;
   PetscCall(scatter(t, X, Xdot));
-  PetscCheck(std::abs(shift - scheme_.slope()) <= 1e-8 * shift, options_.comm(), PETSC_ERR_PLIB,
-             "TS has slope %g, pulmo %g", (double)shift, (double)scheme_.slope());
-  PetscCall(model_.jacobian(t, local_, rate_, shift, A));
+  PetscCall(model_.jacobian(t, local_, rate_, scheme_.slope(), A));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -408,6 +433,8 @@ PetscErrorCode Simulation::keep_step(PetscReal dt)
 
   PetscFunctionBeginUser;
   PetscCall(TSRestartStep(ts_)); // as in reject()
+  PetscCall(heed_signal());
+  if (stopped_) PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
   PetscCall(TSGetAdapt(ts_, &adapt));
   PetscCall(TSSetTimeStep(ts_, dt / adapt->scale_solve_failed));
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -443,7 +470,8 @@ PetscErrorCode Simulation::reject(PetscReal dt, const std::string &reason, Petsc
   failures_.push_back({accepted_.time, dt, reason, newton, measures, inverted});
   cut_ = true;
   ++rejected_;
-  PetscCall(TSRestartStep(ts_)); // if -ts_theta_initial_guess_extrapolate is on: not from a failed state
+  airway_.cut();
+  PetscCall(TSRestartStep(ts_)); // BDF and -ts_theta_initial_guess_extrapolate must not look at a failed state
   PetscCall(TSGetAdapt(ts_, &adapt));
   const PetscReal next = dt * adapt->scale_solve_failed;
   if (next < std::max(adapt->dt_min, least_step * wanted_dt_))
@@ -471,7 +499,7 @@ PetscErrorCode Simulation::after_step()
   row.dt = t - accepted_.time;
   cut_ = false;
   const bool landed = same(t, phase_->end) || same(t, phase_->begin + phase_->ramp);
-  crawled_ = row.dt < crawling_step * wanted_dt_ && !landed ? crawled_ + 1 : 0;
+  crawled_ = row.dt < crawling_step * wanted_dt_ && !landed && !failures_.empty() ? crawled_ + 1 : 0;
   if (crawled_ == 0) failures_.clear();
 
   // state and consistent flux of the accepted step
@@ -505,6 +533,7 @@ PetscErrorCode Simulation::after_step()
     row.flow = scheme_.flow(measures.volume_change) / units::mm3_per_ml;
   }
   PetscCall(VecCopy(local_, before_));
+  const bool kink = (same(t, phase_->begin + phase_->ramp) || airway_.reaches_limit()) && !same(t, phase_->end);
   airway_.accept(row.flow * units::mm3_per_ml);
   row.time = t;
   row.pressure = pressure / units::kPa_per_cmH2O;
@@ -522,7 +551,7 @@ PetscErrorCode Simulation::after_step()
   PetscCall(scheme_.accept(model_, t, measures.volume_change, local_));
   step_control_.accept({t, row.volume, row.pressure});
   accepted_ = row;
-  if (same(t, phase_->begin + phase_->ramp) && !same(t, phase_->end)) {
+  if (kink) {
     begin_smooth_stretch();
     PetscCall(TSRestartStep(ts_));
     if (step_control_.in_use()) PetscCall(TSSetTimeStep(ts_, landing(t)));
@@ -576,15 +605,24 @@ std::string Simulation::failure_text() const
     if (f.newton > 0) text << " after " << f.newton << " Newton steps" << (f.inverted ? ", J <= 0 on the way" : "");
     text << ")";
   }
-  text << ". What to try: ";
-  if (inverted != failures_.rend())
+  text << ".";
+  // tissue that folds at a rim gives way, too; at a limit point all of it is well, and only attempts turn it inside out
+  const bool well = accepted_.min_J > well_formed && phase_ && phase_->control == Control::pressure;
+  const std::string limit = well ? limit_point(rows_) : "";
+  text << limit << " What to try: ";
+  if (!limit.empty())
+    text << "less pressure, prescribed flow (-ventilator vcv), which goes on beyond the limit point, more that holds "
+            "the lung "
+            "(-chest_wall), another -tissue.";
+  else if (inverted != failures_.rend())
     text << "-lumen_pressure if that cell is at the airway, a finer mesh there, a slower rise of pressure or flow, "
-            "another -tissue; the law may have no equilibrium at this pressure.";
+            "another -tissue.";
   else
     text << "another file of petsc_options/solvers, a smaller -ts_dt, a larger -snes_max_it, a slower rise of pressure "
-            "or flow, -snes_linesearch_type basic where volume is far stiffer than shape; -snes_monitor and "
-            "-ksp_monitor "
-            "show where it stalls; the law may have no equilibrium at this pressure.";
+            "or "
+            "flow, -snes_linesearch_type basic where volume is far stiffer than shape; -snes_monitor and -ksp_monitor "
+            "show "
+            "where it stalls.";
   return text.str();
 }
 

@@ -12,10 +12,10 @@ PetscErrorCode ifunction(TS, PetscReal t, Vec X, Vec Xdot, Vec F, void *simulati
   return static_cast<Simulation *>(simulation)->residual(t, X, Xdot, F);
 }
 
-PetscErrorCode ijacobian(TS, PetscReal t, Vec X, Vec Xdot, PetscReal shift, Mat A, Mat P, void *simulation)
+PetscErrorCode ijacobian(TS, PetscReal t, Vec X, Vec Xdot, PetscReal, Mat A, Mat P, void *simulation)
 {
   PetscFunctionBeginUser;
-  PetscCall(static_cast<Simulation *>(simulation)->jacobian(t, X, Xdot, shift, P));
+  PetscCall(static_cast<Simulation *>(simulation)->jacobian(t, X, Xdot, P));
   if (A != P) { // -snes_mf_operator
     PetscCall(MatAssemblyBegin(A, MAT_FINAL_ASSEMBLY));
     PetscCall(MatAssemblyEnd(A, MAT_FINAL_ASSEMBLY));
@@ -101,7 +101,7 @@ PetscErrorCode choose_step(TSAdapt adapt, TS ts, PetscReal h, PetscInt *next_sch
   PetscCall(simulation_of(ts, &simulation));
   *next_scheme = 0;
   *next_h = simulation->next_step(ts->ptime, h, *adapt, *accept);
-  *wlte = *wltea = *wlter = -1; // no error is estimated
+  *wlte = *wltea = *wlter = -1; // PETSc is told no error
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

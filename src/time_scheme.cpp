@@ -26,7 +26,8 @@ PetscErrorCode TimeScheme::setup(TS ts, Vec like)
   PetscCall(DMGetNumFields(dm, &fields));
   gas_ = multistep_ && fields > pressure;
   if (!gas_) PetscFunctionReturn(PETSC_SUCCESS);
-  for (Past *past : {&last_, &earlier_, &middle_}) PetscCall(VecDuplicate(like, past->gas.out()));
+  for (Past *past : {&last_, &earlier_, &middle_})
+    for (VecHandle *v : {&past->state, &past->gas}) PetscCall(VecDuplicate(like, v->out()));
   PetscCall(VecDuplicate(like, zero_.out()));
   PetscCall(VecZeroEntries(zero_));
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -42,6 +43,7 @@ PetscErrorCode TimeScheme::keep(Model &model, PetscReal t, PetscReal volume, Vec
   past.time = t;
   past.volume = volume;
   if (!gas_) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(VecCopy(local, past.state));
   // with dt = 1 s and the state as its own rate the kernels integrate J - 1, and what does not depend on the rate
   PetscCall(VecDuplicate(past.gas, rest.out()));
   PetscCall(model.set_step(1, 0));
@@ -65,6 +67,45 @@ PetscErrorCode TimeScheme::begin(Model &model, PetscReal t, PetscReal volume, Ve
 {
   PetscFunctionBeginUser;
   PetscCall(keep(model, t, volume, local, last_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode TimeScheme::persist(Archive &archive, Model &model, PetscReal t, PetscReal volume, Vec local)
+{
+  bool looks_back = multistep_ && !ts_->steprestart;
+  int there = order();
+  PetscReal earlier_t = earlier_.time, earlier_volume = earlier_.volume;
+
+  PetscFunctionBeginUser;
+  PetscCall(archive.value("time_scheme/order", there));
+  PulmoUserCheck(there == order(), PetscObjectComm((PetscObject)ts_),
+                 "-restart: the checkpoint was made with -ts_type %s; give that", there == 2 ? "bdf" : "beuler");
+  PetscCall(archive.value("time_scheme/looks_back", looks_back));
+  if (looks_back) {
+    VecHandle state;
+    PetscCall(archive.value("time_scheme/time_s", earlier_t));
+    PetscCall(archive.value("time_scheme/volume_mm3", earlier_volume));
+    PetscCall(VecDuplicate(local, state.out()));
+    if (gas_ && !archive.reading()) PetscCall(VecCopy(earlier_.state, state));
+    if (gas_) PetscCall(archive.local("time_scheme/state", state));
+    resumes_ = archive.reading();
+    if (resumes_) PetscCall(keep(model, earlier_t, earlier_volume, state, earlier_));
+  }
+  if (archive.reading()) PetscCall(keep(model, t, volume, local, last_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode TimeScheme::begin_solve(PetscInt steps)
+{
+  PetscFunctionBeginUser;
+  if (resumes_) {
+    // TS takes a first step for a fresh start. Its own past is empty then, which nothing but its guess notices.
+    PetscCall(TSSetStepNumber(ts_, steps));
+    ts_->steprestart = PETSC_FALSE;
+    resumes_ = false;
+  } else {
+    PetscCall(TSRestartStep(ts_));
+  }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

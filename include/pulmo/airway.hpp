@@ -39,6 +39,10 @@ public:
   void begin_stage(PetscReal t, PetscReal step_end, const TimeScheme &scheme);
   /// The attempt at hand failed and is made once more, as it was.
   void again() { retake_ = limited_; }
+  /// The attempt at hand failed and a shorter one is made: that may stay below the limit.
+  void cut() { retake_ = false; }
+  /// Whether the step at hand is the first one that holds the limit of the phase.
+  bool reaches_limit() const { return limited_ && !limited_before_; }
   /// Puts the prescribed pressure, or the last known one, into a global vector.
   PetscErrorCode guess(Vec X) const;
   /// Hands the step to the model; where P is an unknown its value is that of @p X.

@@ -66,7 +66,7 @@ struct Step {
   PetscScalar dt;           ///< size of the step, s
   PetscScalar gas_pressure; ///< pressure held at the airway, kPa
   PetscScalar airway_flux;  ///< outward flux prescribed at the airway (0 while a pressure is held), mm/s
-  PetscScalar load = 1;     ///< share of the dead loads that is there: less than 1 where the first step of a run was cut
+  PetscScalar load = 1; ///< share of the dead loads that is there: less than 1 where the first step of a run was cut
 };
 
 /// A quadrature point as a kernel sees it.

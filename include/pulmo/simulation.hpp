@@ -21,7 +21,7 @@ struct StepReport {
   const std::vector<SignalRow> &rows; ///< of the whole run so far, this one last
   SignalRow row;
   Measures measures;
-  PetscReal mass_balance_error; ///< int (J - 1) - sum dt flow, mm^3
+  PetscReal mass_balance_error; ///< int (J - 1) less what flowed in, by the time scheme, mm^3
   Vec local;                    ///< state with constrained values in place
   PetscReal end;                ///< when the run ends, s
   bool phase_ends;              ///< this row is the last of its phase
@@ -87,7 +87,7 @@ public:
 
   // what PETSc calls back
   PetscErrorCode residual(PetscReal t, Vec X, Vec Xdot, Vec F);
-  PetscErrorCode jacobian(PetscReal t, Vec X, Vec Xdot, PetscReal shift, Mat A);
+  PetscErrorCode jacobian(PetscReal t, Vec X, Vec Xdot, Mat A);
   PetscErrorCode before_stage(PetscReal t);
   /// First guess of a step; comes as the state before it.
   PetscErrorCode guess(SNES snes, Vec X);

@@ -60,7 +60,7 @@ def limit(lab):
     J_top, p_top = limit_point()
     scene = FREE + pulmo.BLOCK + ["-tissue", "yoshihara"]
     run = lab.stopped(scene + ["-ventilator", "pcv", "-ventilator_pip", 20, "-ventilator_ramp", 1],
-                      "the law may have no equilibrium at this pressure", "yoshihara", what="pressure control to 20 cmH2O")
+                      "a limit point. There is no equilibrium above 16.8", "yoshihara", what="pressure control to 20 cmH2O")
     if run:
         rows = run.signals(run.signals_file)
         lab.within("last pressure held (cmH2O)", rows["airway_pressure_cmH2O"][-1], p_top, 0.02)
