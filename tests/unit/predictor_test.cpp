@@ -33,6 +33,7 @@ protected:
   {
     PULMO_OK(VecCreateSeq(PETSC_COMM_SELF, size, x_.out()));
     PULMO_OK(VecDuplicate(x_, f_.out()));
+    PULMO_OK(SNESDestroy(&snes_)); // of an earlier call
     PULMO_OK(SNESCreate(PETSC_COMM_SELF, &snes_));
     PULMO_OK(SNESSetFunction(snes_, f_, evaluate, &problem_));
     PULMO_OK(PetscOptionsSetValue(nullptr, "-predictor_increments", "2"));
@@ -190,6 +191,7 @@ protected:
     PULMO_OK(MatAssemblyBegin(A_, MAT_FINAL_ASSEMBLY));
     PULMO_OK(MatAssemblyEnd(A_, MAT_FINAL_ASSEMBLY));
     PULMO_OK(MatCreateVecs(A_, x_.out(), nullptr));
+    PULMO_OK(SNESDestroy(&snes_)); // of an earlier call
     PULMO_OK(SNESCreate(PETSC_COMM_SELF, &snes_));
     PULMO_OK(SNESSetFunction(snes_, nullptr, evaluate_square, &square_));
     PULMO_OK(SNESSetJacobian(snes_, A_, A_, differentiate_square, &square_));
