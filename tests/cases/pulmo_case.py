@@ -88,7 +88,7 @@ def gas_pressure(law, J):
 class Case:
     """One run of the program: exit code, what it said, what it left."""
 
-    def __init__(self, options, ranks=1, directory=None, timeout=300, launch=False):
+    def __init__(self, options, ranks=1, directory=None, timeout=300, launch=False, cwd=None):
         self.directory = directory or scratch()
         command = [PROGRAM] + [str(o) for o in options]
         if self.directory != "-":  # "-": the options tell
@@ -97,7 +97,7 @@ class Case:
             command = LAUNCHER + [str(ranks)] + command
         self.command = " ".join(command)
         start = time.monotonic()
-        process = subprocess.Popen(command, cwd=SOURCE, env=ENVIRONMENT, text=True, stdout=subprocess.PIPE,
+        process = subprocess.Popen(command, cwd=cwd or SOURCE, env=ENVIRONMENT, text=True, stdout=subprocess.PIPE,
                                    stderr=subprocess.PIPE, start_new_session=True)
         try:
             self.out, self.err = process.communicate(timeout=timeout)

@@ -90,7 +90,7 @@ def scene(dice):
             "-ts_adapt_dt_min", 1e-6, "-ts_max_time", 0.8], ranks, text)
 
 
-@case("Random admissible scenes (seeded)")
+@case("Random admissible scenes (seeded)", "no crash, hang, NaN, trace or silence; nearly all finish", "185 of 200 seeds")
 def fuzz(lab):
     """Laws, parameters, meshes, springs, permeabilities, manoeuvres, steps, solvers and ranks drawn together: combinations that
     nobody thought of."""
@@ -110,7 +110,7 @@ def fuzz(lab):
             finished += 1
         else:
             stopped += 1
-    lab.demand("scenes that finished with J > 0", finished, f"most of {count}", finished > count / 2)
-    lab.demand("scenes that stopped with one clear sentence", stopped, "the rest", finished + stopped + len(faults) == count)
+    lab.demand(f"scenes that finished with J > 0 ({stopped} stopped with one clear sentence)", finished, f"≥ {0.8 * count:.0f} of {count}",
+               finished >= 0.8 * count)
     lab.demand("crash, NaN in a file, hang, PETSc trace, silence", "; ".join(faults[:6]) or "none", "none", not faults)
     lab.said = lab.said[:1]

@@ -12,16 +12,26 @@ from .laws import inflated
 
 REUSE = pulmo.options_file("solvers/reuse.opts")
 ITERATIVE = pulmo.options_file("solvers/iterative.opts")
+# bytes that a step leaves in memory: SignalRow, EnergyBalance with six accounts, and RegionState with one region (vectors of their own)
+ROW = 152 + (48 + 64) + (24 + 48)
 
 
-@case("40 cmH2O in one step")
+@case("A jump to 40 cmH2O", "pressure reaches 40 cmH2O by the end of the first 50 ms, cut or not; V beside rest (small) or half the step",
+      "the lung, the other four laws, -lumen_pressure, halved steps")
 def jump(lab):
-    """The whole pressure meets a lung at rest in its first step: no equilibrium is near the start of Newton's method, and
-    with no ramp a shorter step makes the jump no smaller; only the flow limits what happens in it."""
+    """The whole pressure meets a lung at rest in its first step (50 ms): no equilibrium is near the start of Newton's method.
+    A step that has to be cut takes a share of the jump only, a linear rise within the 50 ms (docs/ventilator.md)."""
+    def jumped(name, run):
+        rows = run.signals()
+        lab.below(f"{name}: pressure beside a rise within the first 50 ms, cut or not (cmH2O)",
+                  np.abs(rows["airway_pressure_cmH2O"] - 40 * np.minimum(1, rows["time_s"] / 0.05)).max(), 1e-9)
+
     if lab.small:
         cube = pulmo.DIRECT + pulmo.PCV + pulmo.CUBE + ["-tissue", "rausch", "-ventilator_pip", 40, "-airflow_permeability", 1e4]
         once = lab.finished(cube + ["-ventilator_ramp", 0, "-ts_max_time", 0.3], "rausch on a cube")
         still = lab.finished(cube + ["-ventilator_ramp", 0.3, "-ts_max_time", 0.3, "-airflow", "off"], "at rest")
+        if once:
+            jumped("rausch on a cube", once)
         if once and still:
             lab.within("V beside that at rest (ml)", once.signals()["volume_ml"][-1], still.signals()["volume_ml"][-1], 1e-6)
         return
@@ -30,17 +40,20 @@ def jump(lab):
         scene = pulmo.DIRECT + pulmo.PCV + pulmo.LUNG + ["-ventilator_pip", 40, "-tissue", law] + ["-lumen_pressure"] * wall
         once = lab.finished(scene + ["-ventilator_ramp", 0, "-ts_max_time", 0.3], name)
         if once:
+            jumped(name, once)
             fine = lab.finished(scene + ["-ventilator_ramp", 0, "-ts_max_time", 0.3, "-ts_dt", 0.025], f"{name}, Δt halved")
             if fine:
                 lab.within(f"{name}: V after 0.3 s beside that of half the step (ml)", once.signals()["volume_ml"][-1],
                            fine.signals()["volume_ml"][-1], 0.02)
 
 
-@case("Square flow of 500 ml in 50 ms")
+@case("Square flow of 500 ml in 50 ms", "the volume set is in, to 10⁻⁹; peak pressure beside that of a smaller step",
+      "the lung, CM2 and CM3, the smaller steps")
 def flood(lab):
     """10 l/s through an airway of 7 cm² into a lung of 1350 ml, in one step or in ten: twenty times the usual flow."""
+    peaks = {}
     for law in ["yoshihara"] if lab.small else ["ma", "birzle", "yoshihara"]:
-        for dt in [0.05] if lab.small or law != "yoshihara" else [0.05, 0.005]:
+        for dt in [0.05] if lab.small or law != "yoshihara" else [0.05, 0.005, 0.0025]:
             mesh = ["-dm_plex_filename", pulmo.mesh("cube_lung.msh"), "-mesh_scale", 11] if lab.small else pulmo.LUNG
             run = lab.finished(pulmo.DIRECT + pulmo.VCV + mesh + [
                 "-tissue", law, "-ventilator_inspiration", 0.05, "-ts_dt", dt, "-ts_max_time", 0.1, "-lumen_pressure"],
@@ -49,9 +62,14 @@ def flood(lab):
                 rows = run.signals()
                 at = int(np.abs(rows["time_s"] - 0.05).argmin())
                 lab.within(f"volume in after 50 ms, {law}, Δt {dt} s (ml)", rows["volume_ml"][at], 500, 1e-9)
+                peaks[law, dt] = rows["airway_pressure_cmH2O"][at]
+    fine = peaks.get(("yoshihara", 0.0025))
+    if fine:
+        lab.within("pressure after 50 ms in ten steps beside that in twenty (cmH2O)", peaks.get(("yoshihara", 0.005), np.nan), fine, 0.02)
+        lab.within("pressure after 50 ms in one step beside that in twenty (cmH2O)", peaks.get(("yoshihara", 0.05), np.nan), fine, 0.2)
 
 
-@case("Time steps from 10⁻⁵ to 1 s")
+@case("Time steps from 10⁻⁵ to 1 s", "first order in Δt; the volume at rest, to 10⁻⁶", "Δt = 10⁻⁵ s")
 def steps(lab):
     """The mass balance is ill conditioned for tiny steps (the flow hides behind storage) and stiff for long ones."""
     lung = pulmo.DIRECT + pulmo.PCV + pulmo.CUBE + ["-tissue", "yoshihara", "-airflow_permeability", 30, "-ventilator_ramp", 0.01]
@@ -72,7 +90,8 @@ def steps(lab):
                        still.signals()["volume_ml"][-1], 1e-6)
 
 
-@case("Springs: K_s = 0 and K_s = 10⁴ kPa/mm")
+@case("Springs: K_s = 0 and K_s = 10⁴ kPa/mm", "free motions refused; closed forms without springs and for stiff ones; Krylov count",
+      "the lung (a cube instead)")
 def springs(lab):
     """Without springs six rigid motions are free; with springs of 10⁵ times the usual stiffness the surface rows outweigh the
     tissue's by six decades."""
@@ -111,7 +130,8 @@ def breath(name, size, more):
     return pulmo.PCV + common
 
 
-@case("The same lung as a mouse's (0.1), three times as large, and in metres")
+@case("The same lung as a mouse's (0.1), three times as large, and in metres", "P, V/size³ and J the same to 10⁻¹⁰, Newton and Krylov counts",
+      "the lung (a cube instead)")
 def scales(lab):
     """Dimensional slips and absolute tolerances show: with k ∝ size² and K_s ∝ 1/size the problem is the same, so are
     iteration counts, pressures, J, and volumes over size³."""
@@ -137,18 +157,19 @@ def scales(lab):
                     ("airway_pressure_cmH2O", 1), ("volume_ml", size**3), ("min_J", 1))) if same else np.inf
                 lab.below(f"{kind}, {solver}, {name}: largest relative difference of P, V, J", worst,
                           1e-10 if solver == "direct" else 1e-6)
-                # rounding may tip one Newton step at the tolerance
-                spare = abs(numbers["newton_iterations"] - counts["newton_iterations"])
-                spare_krylov = abs(numbers["krylov_iterations"] - counts["krylov_iterations"])
+                # no power of two: rounding may tip a step at the tolerance
+                newton, krylov = (abs(numbers[key] - counts[key]) for key in ("newton_iterations", "krylov_iterations"))
                 lab.demand(f"{kind}, {solver}, {name}: Newton and Krylov iterations",
                            f"{numbers['newton_iterations']}, {numbers['krylov_iterations']}",
-                           f"{counts['newton_iterations']}, {counts['krylov_iterations']}", spare == 0 and spare_krylov == 0)
+                           f"{counts['newton_iterations']} ± 1, {counts['krylov_iterations']} ± 2 %",
+                           newton <= 1 and krylov <= 0.02 * counts["krylov_iterations"])
 
 
-@case("Two lungs of very different stiffness on one windpipe")
+@case("Two lungs on springs of very different stiffness, one windpipe", "the volume set; each alone under the pressure found takes what it took",
+      "uniform flow, iterative.opts")
 def two_lungs(lab):
-    """With springs a million times apart the stiff lung is nearly rigid: the one airway pressure is fixed by the soft lung
-    alone, and a bordered Newton step with a poor pressure would push all the gas into the wrong one."""
+    """With springs a million times apart the stiff lung only opens at its airway and inwards, and strains a sixth of the soft one:
+    a bordered Newton step with a poor pressure would push all the gas into the wrong one."""
     K = {"stiff": 1e2, "soft": 1e-4}
     files = {names: airway_test.bodies(*names) for names in (("stiff", "soft"), ("stiff",), ("soft",))}
 
@@ -169,7 +190,7 @@ def two_lungs(lab):
         lab.below("each alone under the pressure found: sum of volumes − both (ml)",
                   np.abs(volume["stiff"] + volume["soft"] - rows["volume_ml"]).max(), 4e-8)
         strain = {name: v.max() / {"stiff": 125, "soft": 64}[name] for name, v in volume.items()}
-        lab.above("strain of the soft lung over that of the stiff", strain["soft"] / strain["stiff"], 1.5)
+        lab.above("strain of the soft lung over that of the stiff", strain["soft"] / strain["stiff"], 5)
     for name, options in {} if lab.small else {"uniform": pulmo.UNIFORM, "iterative": pulmo.COMMON}.items():
         more = ITERATIVE[1:] if name == "iterative" else []
         run = lab.finished(scene("stiff", "soft") + (["-options_file"] + more if more else []) +
@@ -178,7 +199,8 @@ def two_lungs(lab):
             lab.within(f"volume in, {name} (ml)", run.signals()["volume_ml"].max(), 40, 1e-9)
 
 
-@case("A thousand breaths")
+@case("A thousand breaths", "no drift of volumes to 10⁻⁸ V0; mass and energy balance of the whole run; memory: the rows of the signals and no more",
+      "970 breaths, memory")
 def breaths(lab):
     """What leaks or drifts a little per breath adds up: volume, memory, the clock of the phases."""
     count = 30 if lab.small else 1000
@@ -208,15 +230,17 @@ def breaths(lab):
     V0 = run.json()["reference_volume_ml"]
     volume = rows["volume_ml"][ends]
     lab.below("drift of the end-expiratory volume over V0", np.abs(volume[5:] - volume[5]).max() / V0, 1e-8)
-    peaks = rows["volume_ml"][[i - 4 for i in ends]]
+    peaks = np.array([breath.max() for breath in np.split(rows["volume_ml"], ends)[:len(ends)]])
     lab.below("drift of the peak volume over V0", np.abs(peaks[5:] - peaks[5]).max() / V0, 1e-8)
-    lab.below("mass balance over V0, per step", run.json()["mass_balance_error_ml"] / V0 / run.json()["steps"], 1e-8)
+    lab.below("mass balance over V0, largest sum over the run", run.json()["mass_balance_error_ml"] / V0, 1e-8)
     lab.below("energy balance, residual over work", run.json()["energy_j"]["residual_relative"], 1e-7)
+    if lab.small:
+        return
     sizes = np.array(samples)
-    if not lab.small and len(sizes) > 50:
+    lab.above("samples of its memory", len(sizes), 50)
+    if len(sizes) > 50:
         settled = sizes[len(sizes) // 10:]
-        steps_taken = run.json()["steps"] * 0.9
-        lab.curves["memory"] = [np.linspace(0, count, len(sizes)).tolist()[::max(1, len(sizes) // 200)],
-                                (sizes / 1e6).tolist()[::max(1, len(sizes) // 200)]]
-        # each step adds a row of the signals, of the energy and of each region: some 0.5 kB
-        lab.below("memory gained per step after the first tenth (kB)", (settled[-3:].mean() - settled[:3].mean()) / steps_taken / 1e3, 1)
+        gained = (settled[-3:].mean() - settled[:3].mean()) / (0.9 * run.json()["steps"])
+        # kept until the end, for summary.json and for checkpoints: a row of signals, energy and regions per step
+        lab.demand("memory gained per step after the first tenth (bytes)", float(gained), f"< {ROW} (the row kept of each step) + 250",
+                   gained < ROW + 250)
