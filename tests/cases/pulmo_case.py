@@ -86,9 +86,9 @@ def gas_pressure(law, J):
 
 
 class Case:
-    """One run of the program: exit code, what it said, what it left."""
+    """One run of the program: exit code, what it said, what it left. `process`: of Popen."""
 
-    def __init__(self, options, ranks=1, directory=None, timeout=300, launch=False, cwd=None):
+    def __init__(self, options, ranks=1, directory=None, timeout=300, launch=False, **process):
         self.directory = directory or scratch()
         command = [PROGRAM] + [str(o) for o in options]
         if self.directory != "-":  # "-": the options tell
@@ -97,16 +97,16 @@ class Case:
             command = LAUNCHER + [str(ranks)] + command
         self.command = " ".join(command)
         start = time.monotonic()
-        process = subprocess.Popen(command, cwd=cwd or SOURCE, env=ENVIRONMENT, text=True, stdout=subprocess.PIPE,
-                                   stderr=subprocess.PIPE, start_new_session=True)
+        run = subprocess.Popen(command, **({"cwd": SOURCE} | process), env=ENVIRONMENT, text=True, stdout=subprocess.PIPE,
+                               stderr=subprocess.PIPE, start_new_session=True)
         try:
-            self.out, self.err = process.communicate(timeout=timeout)
+            self.out, self.err = run.communicate(timeout=timeout)
         except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            self.out, self.err = process.communicate()
+            os.killpg(run.pid, signal.SIGKILL)
+            self.out, self.err = run.communicate()
             raise AssertionError(f"no end after {timeout} s: {self.command}\n{self.tail()}") from None
         self.seconds = time.monotonic() - start
-        self.code = process.returncode
+        self.code = run.returncode
 
     def tail(self):
         return f"stdout: ...{self.out[-1500:]}\nstderr: {self.err[-3000:]}"

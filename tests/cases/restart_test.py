@@ -468,14 +468,21 @@ class Faults(RestartCase):
             self.expect_error(again.code, again.err, "cannot write " + case.path("checkpoint.h5"))
             self.assertEqual(self.contents(case.directory), before)
 
-    @unittest.skipIf(os.geteuid() == 0, "root writes everywhere")
     def test_read_only_directory(self):
+        """As nobody if the tests run as root, who writes everywhere."""
         case, before = self.started()
-        os.chmod(case.directory, 0o500)
+        who = {"user": "nobody", "group": "nogroup", "extra_groups": []} if os.geteuid() == 0 else {}
+        folders = [case.directory, os.path.dirname(case.directory), os.path.dirname(os.path.dirname(case.directory))]
         try:
-            again = pulmo.Case(PCV + ["-restart", case.path("checkpoint.h5")], directory=case.directory)
+            for folder in folders:
+                os.chmod(folder, 0o555)
+            for readable in (pulmo.PROGRAM, pulmo.mesh("cube_lung.msh"), case.path("checkpoint.h5")):
+                if subprocess.run(["test", "-r", readable], **who).returncode != 0:
+                    self.skipTest(f"nobody cannot read {readable}, and root writes everywhere")
+            again = pulmo.Case(PCV + ["-restart", case.path("checkpoint.h5")], directory=case.directory, **who)
         finally:
-            os.chmod(case.directory, 0o700)
+            for folder in folders:
+                os.chmod(folder, 0o700)
         self.expect_error(again.code, again.err, "cannot be written")
         self.assertEqual(self.contents(case.directory), before)
 

@@ -25,12 +25,8 @@ STALE = "Of another program or other definitions than the rest (run `tools/hard_
 NOT_RUN = "Without a result at this size yet (run `tools/hard_cases`): {names}."
 
 
-def mended(text):
-    return text.replace("|", "\\|")
-
-
 def demand_line(d):
-    return mended(f"{'' if d['met'] else '**missed** '}{d['what']}: {d['measured']} ({d['asked']})")
+    return f"{'' if d['met'] else '**missed** '}{d['what']}: {d['measured']} ({d['asked']})"
 
 
 def short(result):
@@ -53,9 +49,9 @@ def write(folder, results, missing, machine, small, state):
     if stale:
         text += [STALE.format(names="; ".join(stale)), ""]
     header = ["case", "why it is hard", "what is demanded", "result", "steps, cut", "min J", "recovery path", "CPU s"]
-    text += markdown(header, [[f"[{r['title']}](#{r['name']})" + " (old)" * (r["state"] != state), mended(r["why"]), mended(r["asked"]),
+    text += markdown(header, [[f"[{r['title']}](#{r['name']})" + " (old)" * (r["state"] != state), r["why"], r["asked"],
                                short(r), f"{r['steps']}, {r['cut']}" if r["runs"] else "–",
-                               "–" if r["min_J"] is None else f"{r['min_J']:.3g}", mended(r["recovery"]), f"{r['cpu_s']:.0f}"]
+                               "–" if r["min_J"] is None else f"{r['min_J']:.3g}", r["recovery"], f"{r['cpu_s']:.0f}"]
                               for r in results])
     text += ["", *figures(folder, results), "## What is demanded, and what was measured", ""]
     for r in results:
