@@ -254,7 +254,7 @@ class Tools(unittest.TestCase):
         self.assertRegex(text, rf"Of another program.*: {plateau['title']}\.")
         row, = (line for line in text.splitlines() if line.startswith(f"| [{plateau['title']}](#plateau) (old) |"))
         self.assertIn("<br>**missed** pressure / volume: 2 (< 1) |", row)
-        self.assertEqual(row.count("|"), 10)
+        self.assertEqual(row.count("|"), 9)
         for case in (limit, plateau):
             self.assertIn(f"The size of the tests leaves out: {case['left_out']}.", text)
         self.assertIn("![Limit point](limit_point.png)", text)
