@@ -14,9 +14,9 @@ import time
 import unittest
 
 import h5py
-import meshio
 import numpy as np
 
+import case_meshes
 import pulmo_case as pulmo
 
 SAME_RANKS, OTHER_RANKS = 1e-10, 1e-8
@@ -266,30 +266,19 @@ class Agreement(RestartCase):
 class Meshes(RestartCase):
     """Nodes are told apart by where they are, not by their numbers."""
 
-    def write(self, points, blocks, name):
-        """Blocks of (kind, cells, physical tag) with the names of cube_lung.msh."""
-        path = pulmo.scratch(name + ".msh")
-        cells = [(kind, c) for kind, c, _ in blocks]
-        tags = [np.asarray(t) for _, _, t in blocks]
-        meshio.write(path, meshio.Mesh(points, cells, cell_data={"gmsh:physical": tags, "gmsh:geometrical": tags},
-                                       field_data=self.cube.field_data), file_format="gmsh22", binary=False)
-        return ["-dm_plex_filename", path]
-
     def setUp(self):
-        self.cube = meshio.read(pulmo.mesh("cube_lung.msh"))
-        self.blocks = [(kind, self.cube.cells_dict[kind], self.cube.cell_data_dict["gmsh:physical"][kind])
-                       for kind in ("triangle", "tetra")]
+        self.points, self.blocks, self.names = case_meshes.blocks_of("cube_lung.msh")
 
     def test_renumbered(self):
         random_numbers = np.random.default_rng(1)
-        new = random_numbers.permutation(len(self.cube.points)) # [old number]
-        points = np.empty_like(self.cube.points)
-        points[new] = self.cube.points
+        new = random_numbers.permutation(len(self.points)) # [old number]
+        points = np.empty_like(self.points)
+        points[new] = self.points
         blocks = []
         for kind, cells, tags in self.blocks:
             order = random_numbers.permutation(len(cells))
             blocks.append((kind, new[cells][order], tags[order]))
-        renumbered = self.write(points, blocks, "renumbered") + ["-mesh_scale", "1"]
+        renumbered = case_meshes.save(points, blocks, self.names) + ["-mesh_scale", "1"]
         options = CUBE + TWICE + ["-checkpoint_every", "0.45"]
         reference = pulmo.finished(options)
         other = pulmo.finished(options + renumbered + ["-restart", reference.path("checkpoint_previous.h5")])
@@ -297,12 +286,12 @@ class Meshes(RestartCase):
 
     def test_nodes_at_one_place(self):
         """Two blocks that touch without being joined: there are two nodes at each place of the fissure."""
-        mirrored = self.cube.points * [-1, 1, 1]
-        n = len(self.cube.points)
+        mirrored = self.points * [-1, 1, 1]
+        n = len(self.points)
         blocks = list(self.blocks)
         for kind, cells, tags in self.blocks:
             blocks.append((kind, cells[:, [1, 0] + list(range(2, cells.shape[1]))] + n, tags))
-        mesh = self.write(np.vstack([self.cube.points, mirrored]), blocks, "touching") + ["-mesh_scale", "1"]
+        mesh = case_meshes.save(np.vstack([self.points, mirrored]), blocks, self.names) + ["-mesh_scale", "1"]
         options = CUBE + TWICE + mesh + ["-checkpoint_every", "0.45"]
         reference = pulmo.finished(options)
         other = pulmo.finished(options + ["-restart", reference.path("checkpoint_previous.h5")], ranks=2)

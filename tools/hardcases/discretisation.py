@@ -7,7 +7,7 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import spsolve
 
 from . import meshes
-from .lab import case, fields, pulmo
+from .lab import case, case_meshes, pulmo
 from .laws import inflated
 from .loads import ITERATIVE
 
@@ -52,7 +52,7 @@ def projected(x, cells, drained):
 
 def pressures(run):
     """Vertices' coordinates, p over the load, corners of the cells and the vertices' numbers."""
-    x, cells, values = fields(run)
+    x, cells, values = pulmo.fields(run)
     corners = cells[:, :4]
     vertices = np.unique(corners)
     return x, values["pressure"] / LOAD, corners, vertices
@@ -186,7 +186,7 @@ def undrained(lab):
             "-ts_dt", 1, "-ts_max_time", 1, *more], name)
 
     def tip_of(run):
-        x, _, values = fields(run)
+        x, _, values = pulmo.fields(run)
         return values["displacement"].reshape(-1, 3)[np.abs(x[:, 0] - length) < 1e-9, 2].mean()
 
     for name, law, poisson in scenes:
@@ -223,12 +223,12 @@ def bad_cells(lab):
     length, k, n = 1.0, 1 / MODULUS, 10  # c_v = 1 mm²/s
     dt = 0.05
     flat = meshes.box((n, 3, 3), (length, 0.3, 0.3), flatten=0.93)
-    facets = meshes.boundary(flat[1])
+    facets = case_meshes.boundary(flat[1])
     lab.below("quality of the flattest sliver (1: regular)", meshes.quality(*flat), 1e-2)
     columns = {"cubes": meshes.box_options((n, 2, 2), (length, 0.2, 0.2)),
                "plates 100 : 1": meshes.box_options((n, 2, 2), (length, 20, 20)),
                "plates 100 : 1, finer": None if lab.small else meshes.box_options((2 * n, 4, 4), (length, 20, 20)),
-               "slivers": meshes.write(*flat, facets, meshes.faces_of_box(flat[0], facets, (length, 0.3, 0.3))),
+               "slivers": case_meshes.write(*flat, facets, case_meshes.faces_of_box(flat[0], facets, (length, 0.3, 0.3))),
                "no inner node": meshes.box_options((n, 1, 1), (length, 0.1, 0.1))}
     errors = {}
     for name, mesh in columns.items():
@@ -253,13 +253,13 @@ def bad_cells(lab):
                      "plates 200 : 1, iterative")
     # one cube of six cells, all nodes on its boundary
     points, tets = meshes.box((1, 1, 1), (10, 10, 10))
-    facets = meshes.boundary(tets)
-    faces = ["airway" if f == "x1" else "pleura" for f in meshes.faces_of_box(points, facets, (10, 10, 10))]
-    run = lab.finished(pulmo.DIRECT + pulmo.PCV + meshes.write(points, tets, facets, faces) + [
+    facets = case_meshes.boundary(tets)
+    faces = ["airway" if f == "x1" else "pleura" for f in case_meshes.faces_of_box(points, facets, (10, 10, 10))]
+    run = lab.finished(pulmo.DIRECT + pulmo.PCV + case_meshes.write(points, tets, facets, faces) + [
         "-tissue", "yoshihara", "-airflow_permeability", 100, "-ts_max_time", 1], "six cells, a breath")
     if run:
         lab.below("six cells: energy balance, residual over work", run.json()["energy_j"]["residual_relative"], 1e-8)
-    run = lab.finished(pulmo.DIRECT + pulmo.STILL + pulmo.PINS + meshes.write(points, tets, facets, faces) + [
+    run = lab.finished(pulmo.DIRECT + pulmo.STILL + pulmo.PINS + case_meshes.write(points, tets, facets, faces) + [
         "-tissue", "yoshihara", "-ventilator", "pcv", "-ventilator_pip", 12, "-ventilator_ramp", 1, "-ts_max_time", 1], "free")
     if run:
         lab.within("six cells: J at 12 cmH2O, free", run.signals()["max_J"][-1], inflated("yoshihara", 12, 1, 2.53), 1e-7)

@@ -3,7 +3,7 @@ import math
 import random
 
 from . import meshes
-from .lab import case, first_sentence, pulmo
+from .lab import case, case_meshes, first_sentence, pulmo
 
 TISSUE = {"berger": {"mu": 0.2808, "lambda": 0.4212}, "ma": {"c": 2}, "birzle": {"c": 0.3567, "c1": 0.2782, "c3": 5.766e-3},
           "yoshihara": {"c": 1.298, "beta": 0.75}, "rausch": {"c_q": 4.1, "c_c": 20.7, "kappa": 16.5}}
@@ -46,9 +46,9 @@ def scene(dice):
     if shape == "box":
         lengths = [10 * between(dice, 0.3, 3) for _ in range(3)]
         points, tets = meshes.box([dice.randint(1, 3) for _ in range(3)], lengths)
-        facets = meshes.boundary(tets)
-        names = ["airway" if f == "x1" else "pleura" for f in meshes.faces_of_box(points, facets, lengths)]
-        options += meshes.write(points, tets, facets, names)
+        facets = case_meshes.boundary(tets)
+        names = ["airway" if f == "x1" else "pleura" for f in case_meshes.faces_of_box(points, facets, lengths)]
+        options += case_meshes.write(points, tets, facets, names)
         volume = lengths[0] * lengths[1] * lengths[2]
     else:
         options += ["-dm_plex_filename", pulmo.mesh(f"{shape}.msh")]

@@ -14,6 +14,7 @@ import h5py
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent.parent / "tests/cases"))
+import case_meshes  # noqa: E402, F401: of the cases
 import pulmo_case as pulmo  # noqa: E402
 
 CASES = {}  # name -> function, in the order of the page
@@ -214,16 +215,6 @@ def run_case(name, program, small):
     except Exception as error:  # noqa: BLE001: whatever went wrong belongs on the page
         lab.demand("the case itself runs", f"{type(error).__name__}: {error}"[:400], "no exception", False)
     return lab.result(name, function)
-
-
-def fields(run, step=-1):
-    """Of a snapshot: mid-nodes included coordinates, cells (10 nodes each) and a reader of its values by name."""
-    names = sorted(n for n in run.files() if re.fullmatch(r"fields_\d+\.h5", n))
-    with h5py.File(run.path("fields.h5")) as file:
-        x, cells = file["geometry"][:], file["topology"][:].reshape(-1, 10)
-    with h5py.File(run.path(names[step])) as file:
-        values = {name: file[name][()] for name in file if isinstance(file[name], h5py.Dataset)}
-    return x, cells, values
 
 
 def resident(pid):
