@@ -164,7 +164,7 @@ def jumps(lab):
 
 
 @case("Undrained limit: a beam that cannot change its volume", "Timoshenko's tip, with one cube over the height too; the tip converges with the mesh",
-      "the finest mesh with its rates, the skeleton of ν = 0.4995")
+      "the finest mesh with its rates; of the skeleton of ν = 0.4995 Timoshenko's tip")
 def undrained(lab):
     """Air that cannot leave makes the tissue incompressible: elements that lock are too stiff by factors in bending.
     (Cook's membrane and its rates: tests/verification.)"""
@@ -177,26 +177,29 @@ def undrained(lab):
     soft = ["-tissue", "yoshihara"]
     rigid = ["-tissue", "berger", "-tissue_mu", mu, "-tissue_lambda", 1e3 * mu, "-tissue_phi0", 1]
     gas = ["-airflow", "-airflow_surfaces", "x1", "-airflow_permeability", 1e-12]
-    scenes = [("drained", soft, nu), ("undrained", soft + gas, 0.5)]
-    if not lab.small:
-        scenes.append(("skeleton of ν = 0.4995, drained", rigid, 1e3 / (2 * (1e3 + 1))))
-    def bent(law, n, load, name, more=()):
+    # where volume is 10³ times as stiff as shape the search for a smaller residual allows crawling steps only, and whole Newton
+    # steps are the way
+    scenes = [("drained", soft, nu, counts), ("undrained", soft + gas, 0.5, counts),
+              ("skeleton of ν = 0.4995, drained, -snes_linesearch_type basic", rigid + ["-snes_linesearch_type", "basic"],
+               1e3 / (2 * (1e3 + 1)), counts[1:] if lab.small else counts)]
+
+    def bent(law, n, load, name):
         return lab.finished(pulmo.DIRECT + meshes.box_options(n, (length, width, width)) + law + [
             "-support", "-support_surfaces", "x0", "-traction", "-traction_surfaces", "x1", "-traction_value", f"0,0,{load / width**2}",
-            "-ts_dt", 1, "-ts_max_time", 1, *more], name)
+            "-ts_dt", 1, "-ts_max_time", 1], name)
 
     def tip_of(run):
         x, _, values = pulmo.fields(run)
         return values["displacement"].reshape(-1, 3)[np.abs(x[:, 0] - length) < 1e-9, 2].mean()
 
-    for name, law, poisson in scenes:
+    for name, law, poisson, meshes_of in scenes:
         E = 2 * mu * (1 + poisson)
         exact = force * length**3 / (3 * E * inertia) + force * length / (mu * shear_area)
-        for n in counts:
+        for n in meshes_of:
             run = bent(law, n, force, f"{name}, {n}")
             if run:
                 tip[name, n] = tip_of(run) / exact
-        if (name, counts[-1]) in tip:
+        if (name, counts[-1]) in tip and (law[1] != "berger" or not lab.small):
             lab.within(f"{name}: tip over Timoshenko's beam, {counts[-1][0]} × {counts[-1][1]} × {counts[-1][2]} cubes",
                        tip[name, counts[-1]], 1, 0.05 if lab.small else 0.03)
             lab.above(f"{name}: the same with one cube over the height", tip[name, counts[0]], 0.9)
@@ -204,15 +207,10 @@ def undrained(lab):
             a, b, c = (tip[name, n] for n in counts)
             lab.above(f"{name}: rate of the tip, from 1, 2 and 4 cubes over the height ({a:.4f}, {b:.4f}, {c:.4f})",
                       np.log2((b - a) / (c - b)), 1)
-    # ten times the load at once: the dead load is cut with the first step; where volume is 10³ times as stiff as shape the
-    # search for a smaller residual allows crawling steps only, and whole Newton steps are the way
-    for name, law, poisson, more in (("drained", soft, nu, ()),
-                                     ("skeleton of ν = 0.4995", rigid, 1e3 / (2 * (1e3 + 1)), ("-snes_linesearch_type", "basic"))):
-        E = 2 * mu * (1 + poisson)
-        exact = 10 * force * length**3 / (3 * E * inertia) + 10 * force * length / (mu * shear_area)
-        run = bent(law, (20, 2, 2), 10 * force, f"{name}, ten times the load", more)
-        if run:
-            lab.within(" ".join((f"{name}, ten times the load, 20 × 2 × 2 cubes: tip over Timoshenko's beam", *more)), tip_of(run) / exact, 1, 0.05)
+        # ten times the load at once: the dead load is cut with the first step; what the mesh lacks is the same
+        run = bent(law, counts[1], 10 * force, f"{name}, ten times the load") if "undrained" not in name else None
+        if run and (name, counts[1]) in tip:
+            lab.within(f"{name}: tip under ten times the load over ten times the tip, 20 × 2 × 2 cubes", tip_of(run) / exact / 10, tip[name, counts[1]], 0.01)
 
 
 @case("Stretched cells (100 : 1), slivers, cells with all nodes on the boundary",
