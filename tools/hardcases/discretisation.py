@@ -206,7 +206,7 @@ def undrained(lab):
         if not lab.small and all((name, n) in tip for n in counts):
             a, b, c = (tip[name, n] for n in counts)
             lab.above(f"{name}: rate of the tip, from 1, 2 and 4 cubes over the height ({a:.4f}, {b:.4f}, {c:.4f})",
-                      np.log2((b - a) / (c - b)), 1)
+                      np.log2((b - a) / (c - b)), 1.5)
         # ten times the load at once: the dead load is cut with the first step; what the mesh lacks is the same
         run = bent(law, counts[1], 10 * force, f"{name}, ten times the load") if "undrained" not in name else None
         if run and (name, counts[1]) in tip:

@@ -4,7 +4,6 @@ Every run is held to what is asked of all of them, whatever the case: it ends in
 sentence; no accepted state has J <= 0; no file holds a number that is none.
 """
 import math
-import os
 import re
 import resource
 import sys
@@ -218,9 +217,9 @@ def run_case(name, program, small):
 
 
 def resident(pid):
-    """Resident memory of a process, bytes; 0 if it has ended."""
+    """Resident memory of a process without that of files (programs, libraries), bytes; 0 if it has ended."""
     try:
-        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, IndexError):
+        return 1024 * int(re.search(r"RssAnon:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())[1])
+    except (OSError, TypeError):
         return 0
 
