@@ -1,32 +1,21 @@
 #!/usr/bin/python3
 """The airway: a tube obeys its own equation, two bodies on one airway share the flow as they should, and an iterative
 solver finds the same."""
-import re
 import unittest
 
-import h5py
-import meshio
 import numpy as np
 from scipy.optimize import brentq
 
 import pulmo_case as pulmo
+from case_meshes import bodies
 
 ITERATIVE = pulmo.options_file("solvers/iterative.opts")
 
 
-def replay(rows):
-    """A programme that prescribes the airway pressure of each row at the row's time."""
-    return pulmo.programme("".join(f"step {dt:.17g} pressure {p:.17g}\n"
-                                   for dt, p in zip(rows["dt_s"][1:], rows["airway_pressure_cmH2O"][1:])))
-
-
 def fields(case, step=-1):
     """Of a snapshot: vertices' coordinates and pressures, volume and J of each cell and its middle."""
-    names = sorted(n for n in case.files() if re.fullmatch(r"fields_\d+\.h5", n))
-    with h5py.File(case.path("fields.h5")) as f:
-        x, cells = f["geometry"][:], f["topology"][:].reshape(-1, 10)[:, :4]
-    with h5py.File(case.path(names[step])) as f:
-        p, J = (f["pressure"][:] if "pressure" in f else None), f["J"][:]
+    x, cells, values = pulmo.fields(case, step)
+    cells, p, J = cells[:, :4], values.get("pressure"), values["J"]
     a, b, c, d = (x[cells[:, i]] for i in range(4))
     volume = np.abs(np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a)) / 6
     return x, cells, p, volume, J, (a + b + c + d) / 4
@@ -106,34 +95,9 @@ class Tube(unittest.TestCase):
         self.assertAlmostEqual((tubed - bare) / K1, 1, delta=0.02, msg=f"R {bare} -> {tubed}")
 
 
-def bodies(*names):
-    """A mesh of cubes made of meshes/cube_lung.msh: `stiff` of 50 mm, `soft` of 40 mm beside it; each has its airway
-    at the face of largest x and gives its name to the other faces."""
-    cube = meshio.read(pulmo.mesh("cube_lung.msh"))
-    number = {name: tag for name, (tag, _) in cube.field_data.items()}
-    tags = {"airway": 1, "stiff": 2, "soft": 3, "lung": 4}
-    points, cells, physical = [], {"triangle": [], "tetra": []}, {"triangle": [], "tetra": []}
-    for name in names:
-        for kind, faces in cells.items():
-            faces.append(cube.cells_dict[kind] + sum(map(len, points)))
-            here = cube.cell_data_dict["gmsh:physical"][kind]
-            physical[kind].append(np.select([here == number["airway"], here == number["pleura"]],
-                                            [tags["airway"], tags[name]], tags["lung"]))
-        points.append(cube.points * (5 if name == "stiff" else 4) + ([0, 0, 0] if name == "stiff" else [100, 0, 0]))
-    physical = [np.concatenate(physical[kind]) for kind in cells]
-    path = pulmo.scratch("bodies.msh")
-    meshio.Mesh(np.concatenate(points), [(kind, np.concatenate(faces)) for kind, faces in cells.items()],
-                cell_data={"gmsh:physical": physical, "gmsh:geometrical": physical},
-                field_data={name: np.array([tags[name], 3 if name == "lung" else 2])
-                            for name in ("airway", "lung") + names}).write(path, file_format="gmsh22", binary=False)
-    return ["-dm_plex_filename", path]
-
-
 class TwoBodies(unittest.TestCase):
     """Two lungs, one windpipe: a stiff one of 125 ml and a soft one of 64 ml, apart from each other."""
     SPRINGS = {"stiff": "0.2", "soft": "0.01"}
-    FLOW = ["-ventilator", "vcv", "-ventilator_tidal_volume", "40", "-ventilator_inspiration", "0.3",
-            "-ventilator_pause", "0.2", "-ventilator_expiration", "0.3", "-airflow_permeability", "2e3"]
     AREA = {"stiff": 2500.0, "soft": 1600.0}
 
     @classmethod
@@ -159,11 +123,11 @@ class TwoBodies(unittest.TestCase):
         """Each body alone, driven by the pressure that was found, takes what it took; together the set volume."""
         for scene in ([], pulmo.STILL):
             with self.subTest(scene):
-                flow = [o for o in self.FLOW if not scene or o not in self.FLOW[-2:]]
+                flow = [o for o in pulmo.FLOW_OF_TWO if not scene or o not in pulmo.FLOW_OF_TWO[-2:]]
                 base = self.options(["stiff", "soft"]) + self.both + flow + pulmo.COMMON + scene
                 case = pulmo.finished(base)
                 rows = case.signals()
-                single = {name: pulmo.finished(self.options([name]) + self.alone[name] + replay(rows) + scene +
+                single = {name: pulmo.finished(self.options([name]) + self.alone[name] + pulmo.replay(rows) + scene +
                                                ([] if scene else ["-airflow_permeability", "2e3"])).signals()
                           for name in self.SPRINGS}
                 np.testing.assert_allclose(single["stiff"]["volume_ml"] + single["soft"]["volume_ml"],
@@ -190,13 +154,13 @@ class TwoBodies(unittest.TestCase):
 
     def test_uniform(self):
         """By area: each body takes its share of the volume whatever its stiffness; the airway pressure is the mean."""
-        case = pulmo.finished(self.options(["stiff", "soft"]) + self.both + self.FLOW + pulmo.UNIFORM)
+        case = pulmo.finished(self.options(["stiff", "soft"]) + self.both + pulmo.FLOW_OF_TWO + pulmo.UNIFORM)
         rows = case.signals()
         flowing = np.array([p != "expiration" for p in rows["phase"]])
         single, mean, total = {}, 0, sum(self.AREA.values())
         for name, area in self.AREA.items():
             share = area / total
-            single[name] = pulmo.finished(self.options([name]) + self.alone[name] + self.FLOW + pulmo.UNIFORM + [
+            single[name] = pulmo.finished(self.options([name]) + self.alone[name] + pulmo.FLOW_OF_TWO + pulmo.UNIFORM + [
                 "-ventilator_tidal_volume", repr(40 * share), "-ts_max_time", "0.5"]).signals()
             mean = mean + share * single[name]["airway_pressure_cmH2O"]
         np.testing.assert_allclose(rows["airway_pressure_cmH2O"][flowing], mean, rtol=1e-9)

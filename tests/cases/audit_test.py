@@ -4,6 +4,7 @@ import unittest
 
 import numpy as np
 
+import case_meshes
 import pulmo_case as pulmo
 from output_test import quadratic_shapes, read_fields, tetrahedron_rule
 
@@ -16,64 +17,27 @@ PERMEABILITY, STIFFNESS = 300.0, {"pleura": 0.08, "airway": 0.05}
 GAS = ["-airflow_permeability", PERMEABILITY, "-chest_wall_stiffness_airway", STIFFNESS["airway"]]
 ENERGY = ["ventilator_work", "external", "elastic_tissue", "elastic_springs", "resistive", "resistive_tube",
           "numerical_dissipation", "residual"]
-KUHN = [(0, 1, 3, 7), (0, 3, 2, 7), (0, 2, 6, 7), (0, 6, 4, 7), (0, 4, 5, 7), (0, 5, 1, 7)]  # corners x + 2 y + 4 z
 FACES = ((0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2))
 EDGE_PAIRS = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
 
 
-def block(corner, size, n, points, cells):
-    """Adds a box of n[0] x n[1] x n[2] cubes of six tetrahedra; returns their numbers."""
-    first = len(points)
-    shape = [k + 1 for k in n]
-    for k in range(shape[2]):
-        for j in range(shape[1]):
-            for i in range(shape[0]):
-                points.append([corner[d] + size[d] * (i, j, k)[d] / n[d] for d in range(3)])
-    begin = len(cells)
-    for k in range(n[2]):
-        for j in range(n[1]):
-            for i in range(n[0]):
-                cube = [first + i + a + shape[0] * (j + b + shape[1] * (k + c))
-                        for c in (0, 1) for b in (0, 1) for a in (0, 1)]
-                cells += [[cube[v] for v in tet] for tet in KUHN]
-    return list(range(begin, len(cells)))
-
-
-def two_bodies(path, volume_names):
-    """Two boxes of different size beside each other as MSH 2.2; the airway is the lower face of each.
+def two_bodies(volume_names):
+    """Options of two boxes of different size beside each other; the airway is the lower face of each.
 
     @param volume_names function of (body, centroid) that gives the physical name of a cell, or None.
     """
-    points, cells = [], []
-    bodies = [block((30, 0, 0), (12, 10, 9), (2, 2, 2), points, cells), block((0, 0, 0), (10, 10, 14), (2, 2, 3), points, cells)]
-    points = np.array(points)
-    faces = {}
-    for cell in cells:
-        for face in FACES:
-            corners = [cell[v] for v in face]
-            faces.setdefault(tuple(sorted(corners)), []).append(corners)
-    boundary = [found[0] for found in faces.values() if len(found) == 1]
-    tags = {"airway": (2, 1), "pleura": (2, 2)}
-    lines = []
-    for corners in boundary:
-        tag = tags["airway" if np.abs(points[corners, 2]).max() < 1e-9 else "pleura"][1]
-        lines.append([2, tag, corners])
-    for b, body in enumerate(bodies):
-        for c in body:
-            name = volume_names(b, points[cells[c]].mean(axis=0))
-            if name and name not in tags:
-                tags[name] = (3, len(tags) + 1)
-            lines.append([4, tags[name][1] if name else 99, cells[c]])
-    with open(path, "w") as f:
-        f.write("$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$PhysicalNames\n%d\n" % len(tags))
-        f.writelines('%d %d "%s"\n' % (dim, tag, name) for name, (dim, tag) in tags.items())
-        f.write("$EndPhysicalNames\n$Nodes\n%d\n" % len(points))
-        f.writelines("%d %.17g %.17g %.17g\n" % (i + 1, *x) for i, x in enumerate(points))
-        f.write("$EndNodes\n$Elements\n%d\n" % len(lines))
-        f.writelines("%d %d 2 %d %d %s\n" % (i + 1, kind, tag, tag, " ".join(str(v + 1) for v in corners))
-                     for i, (kind, tag, corners) in enumerate(lines))
-        f.write("$EndElements\n")
-    return path
+    boxes = [case_meshes.kuhn((2, 2, 2), (12, 10, 9)), case_meshes.kuhn((2, 2, 3), (10, 10, 14))]
+    points = np.vstack([boxes[0][0] + [30, 0, 0], boxes[1][0]])
+    parts = [boxes[0][1], boxes[1][1] + len(boxes[0][0])]
+    cells = np.vstack(parts)
+    facets = case_meshes.boundary(cells)
+    tags = {None: (99, 3), "airway": (1, 2), "pleura": (2, 2)}
+    volumes = [volume_names(b, points[c].mean(axis=0)) for b, part in enumerate(parts) for c in part]
+    for name in volumes:
+        tags.setdefault(name, (len(tags), 3))
+    surface = np.where(np.abs(points[facets][:, :, 2]).max(axis=1) < 1e-9, 1, 2)
+    return case_meshes.save(points, [("triangle", facets, surface), ("tetra", cells, [tags[name][0] for name in volumes])],
+                            {name: tag for name, tag in tags.items() if name})
 
 
 class Fields:
@@ -237,8 +201,7 @@ class Regions(unittest.TestCase):
     """Two bodies of different size and two breaths; the numbers of each from the fields."""
 
     def run_mesh(self, volume_names, ranks=1, more=()):
-        path = two_bodies(pulmo.scratch("bodies.msh"), volume_names)
-        return pulmo.finished(pulmo.TIGHT + pulmo.PCV + ["-dm_plex_filename", path, "-mesh_scale", "1"] + BREATHS + GAS +
+        return pulmo.finished(pulmo.TIGHT + pulmo.PCV + two_bodies(volume_names) + ["-mesh_scale", "1"] + BREATHS + GAS +
                               list(more), ranks=ranks)
 
     def check(self, case, name, chosen):

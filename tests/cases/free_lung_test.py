@@ -7,11 +7,11 @@ lungs that were turned and moved before they are read, so that other vertices ar
 import unittest
 
 import h5py
-import meshio
 import numpy as np
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
+import case_meshes
 import pulmo_case as pulmo
 
 PINS = ["-chest_wall", "off", "-support", "-support_rigid"]
@@ -37,20 +37,14 @@ class Lung:
     """Points, cells and names of a mesh of one body, and what statics needs of its surface."""
 
     def __init__(self, name):
-        mesh = meshio.read(pulmo.mesh(name))
-        self.points, self.names = mesh.points, mesh.field_data
-        tags = mesh.cell_data["gmsh:physical"]
-        self.cells = [(c.type, c.data, t) for c, t in zip(mesh.cells, tags)]
+        self.points, self.cells, self.names = case_meshes.blocks_of(name)
 
     def written(self, *bodies):
         """A file with a copy of the lung for each body (rotation, shift)."""
-        path, n = pulmo.scratch("moved.msh"), len(self.points)
+        n = len(self.points)
         points = np.vstack([rotation.apply(self.points) + shift for rotation, shift in bodies])
-        cells = [(kind, data + k * n) for k in range(len(bodies)) for kind, data, _ in self.cells]
-        tags = [t for _ in bodies for _, _, t in self.cells]
-        meshio.write(path, meshio.Mesh(points, cells, field_data=self.names, cell_data={
-            "gmsh:physical": tags, "gmsh:geometrical": tags}), "gmsh22", binary=False)
-        return ["-dm_plex_filename", path]
+        return case_meshes.save(points, [(kind, data + k * n, tags) for k in range(len(bodies)) for kind, data, tags in self.cells],
+                                self.names)
 
     def facets(self, name=None):
         """Corners (n, 3, 3) of the boundary triangles of one surface, or of all."""

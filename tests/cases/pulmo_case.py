@@ -6,6 +6,7 @@ By hand: tests/cases/output_test.py build/pulmo
 import csv
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import tempfile
 import time
 import unittest
 
+import h5py
 import numpy as np
 
 SOURCE = os.environ.get("PULMO_SOURCE_DIR", os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))))
@@ -49,6 +51,9 @@ ROLLERS = ["-support", "-support_surfaces", "x0,y0,z0", "-support_components_x0"
 SCENE = ["-tissue", "birzle", "-airflow", "-airflow_permeability", "1e4", "-chest_wall"]  # all but a ventilator
 STILL = ["-airflow", "off"]
 UNIFORM, COMMON = ["-ventilator_flow_split", "uniform"], ["-ventilator_flow_split", "common_pressure"]
+# 40 ml into case_meshes.bodies, a pause in which they exchange gas
+FLOW_OF_TWO = ["-ventilator", "vcv", "-ventilator_tidal_volume", "40", "-ventilator_inspiration", "0.3",
+               "-ventilator_pause", "0.2", "-ventilator_expiration", "0.3", "-airflow_permeability", "2e3"]
 QUIET = ["-progress", "off"]
 
 
@@ -62,6 +67,12 @@ def programme(text):
     with open(path, "w") as f:
         f.write(text)
     return ["-ventilator", "programme", "-ventilator_programme", path]
+
+
+def replay(rows):
+    """A programme that prescribes the airway pressure of each row at the row's time."""
+    return programme("".join(f"step {dt:.17g} pressure {p:.17g}\n"
+                             for dt, p in zip(rows["dt_s"][1:], rows["airway_pressure_cmH2O"][1:])))
 
 
 def gas_pressure(law, J):
@@ -86,9 +97,9 @@ def gas_pressure(law, J):
 
 
 class Case:
-    """One run of the program: exit code, what it said, what it left."""
+    """One run of the program: exit code, what it said, what it left. `process`: of Popen."""
 
-    def __init__(self, options, ranks=1, directory=None, timeout=300, launch=False):
+    def __init__(self, options, ranks=1, directory=None, timeout=300, launch=False, **process):
         self.directory = directory or scratch()
         command = [PROGRAM] + [str(o) for o in options]
         if self.directory != "-":  # "-": the options tell
@@ -97,16 +108,16 @@ class Case:
             command = LAUNCHER + [str(ranks)] + command
         self.command = " ".join(command)
         start = time.monotonic()
-        process = subprocess.Popen(command, cwd=SOURCE, env=ENVIRONMENT, text=True, stdout=subprocess.PIPE,
-                                   stderr=subprocess.PIPE, start_new_session=True)
+        run = subprocess.Popen(command, **({"cwd": SOURCE} | process), env=ENVIRONMENT, text=True, stdout=subprocess.PIPE,
+                               stderr=subprocess.PIPE, start_new_session=True)
         try:
-            self.out, self.err = process.communicate(timeout=timeout)
+            self.out, self.err = run.communicate(timeout=timeout)
         except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            self.out, self.err = process.communicate()
+            os.killpg(run.pid, signal.SIGKILL)
+            self.out, self.err = run.communicate()
             raise AssertionError(f"no end after {timeout} s: {self.command}\n{self.tail()}") from None
         self.seconds = time.monotonic() - start
-        self.code = process.returncode
+        self.code = run.returncode
 
     def tail(self):
         return f"stdout: ...{self.out[-1500:]}\nstderr: {self.err[-3000:]}"
@@ -130,6 +141,16 @@ class Case:
     def json(self, name="summary.json"):
         with open(self.path(name)) as f:
             return json.load(f)
+
+
+def fields(case, step=-1):
+    """Of a snapshot: mid-nodes included coordinates, cells (10 nodes each) and a reader of its values by name."""
+    names = sorted(n for n in case.files() if re.fullmatch(r"fields_\d+\.h5", n))
+    with h5py.File(case.path("fields.h5")) as file:
+        x, cells = file["geometry"][:], file["topology"][:].reshape(-1, 10)
+    with h5py.File(case.path(names[step])) as file:
+        values = {name: file[name][()] for name in file if isinstance(file[name], h5py.Dataset)}
+    return x, cells, values
 
 
 def finished(options, **arguments):

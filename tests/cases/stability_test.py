@@ -93,6 +93,7 @@ class Gallery(unittest.TestCase):
 def add(name):
     def test(self):
         result = gallery.run_case(name, pulmo.PROGRAM, small=True)
+        print(f"{result['cpu_s']:.1f} s CPU ... ", end="", file=sys.stderr, flush=True)
         self.assertGreater(len(result["demands"]), 0)
         for demand in result["demands"]:
             with self.subTest(demand["what"]):

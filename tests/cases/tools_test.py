@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import pathlib
 import subprocess
 import sys
 import unittest
@@ -13,6 +14,7 @@ import pulmo_case as pulmo
 
 sys.path.insert(0, os.path.join(pulmo.SOURCE, "tools"))
 from benchmarks import assembly, common, memory, operations, scaling  # noqa: E402
+from hardcases import gallery, page  # noqa: E402
 
 
 def tool(name, *arguments):
@@ -232,6 +234,33 @@ class Tools(unittest.TestCase):
         pairs = scaling.face_pairs(tets)
         self.assertEqual(len(pairs), 6 * 12 + 2 * 11)  # inside each cube, and between two
         self.assertEqual(scaling.surfaces(tets, pairs, 2), {"faces": 2, "neighbours": 1, "imbalance": 1})
+
+    def test_hard_cases_are_listed(self):
+        listed = tool("hard_cases", "--list")
+        self.assertEqual(listed.returncode, 0, listed.stderr)
+        self.assertEqual([line.split()[0] for line in listed.stdout.splitlines()], list(gallery.CASES))
+
+    def test_page_of_hard_cases(self):
+        """A row per case, a line per demand, what was missed and what is old or absent; the figure of what a case left."""
+        folder = pathlib.Path(pulmo.scratch())
+        limit, plateau = (gallery.run_case(name, pulmo.PROGRAM, small=True) for name in ("limit", "plateau"))
+        limit["state"], plateau["state"] = "new", "old"
+        plateau["demands"].append({"what": "pressure | volume", "measured": "2", "asked": "< 1", "met": False})
+        page.write(folder, [limit, plateau], ["Another case"], "a machine", True, "new")
+        text = (folder / "README.md").read_text()
+        asked, met = (sum(f(d) for r in (limit, plateau) for d in r["demands"]) for f in (bool, lambda d: d["met"]))
+        self.assertIn(f"**{met} of {asked} demands are met", text)
+        self.assertRegex(text, r"Without a result.*Another case\.")
+        self.assertRegex(text, rf"Of another program.*: {plateau['title']}\.")
+        row, = (line for line in text.splitlines() if line.startswith(f"| [{plateau['title']}](#plateau) (old) |"))
+        self.assertIn("<br>**missed** pressure / volume: 2 (< 1) |", row)
+        self.assertEqual(row.count("|"), 9)
+        for case in (limit, plateau):
+            self.assertIn(f"The size of the tests leaves out: {case['left_out']}.", text)
+        self.assertIn("![Limit point](limit_point.png)", text)
+        self.assertGreater((folder / "limit_point.png").stat().st_size, 1000)
+        self.assertEqual([(row["case"], row["demand"], row["met"]) for row in table(folder / "hard_cases.csv")],
+                         [(r["name"], d["what"], str(d["met"])) for r in (limit, plateau) for d in r["demands"]])
 
     def test_operations_are_counted(self):
         for mnemonic, operands, expected in (("vfmadd231pd", "%ymm1,%ymm2,%ymm3", (8, False)), ("vfnmadd213sd", "(%rax),%xmm1,%xmm2", (2, False)),

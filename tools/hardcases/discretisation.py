@@ -7,7 +7,7 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import spsolve
 
 from . import meshes
-from .lab import case, fields, pulmo
+from .lab import case, case_meshes, pulmo
 from .laws import inflated
 from .loads import ITERATIVE
 
@@ -52,13 +52,15 @@ def projected(x, cells, drained):
 
 def pressures(run):
     """Vertices' coordinates, p over the load, corners of the cells and the vertices' numbers."""
-    x, cells, values = fields(run)
+    x, cells, values = pulmo.fields(run)
     corners = cells[:, :4]
     vertices = np.unique(corners)
     return x, values["pressure"] / LOAD, corners, vertices
 
 
-@case("Very low permeability: 10⁴ to 10⁻⁶, first step far below h²/(6 c_v)")
+@case("Very low permeability: 10⁴ to 10⁻⁶, first step far below h²/(6 c_v)",
+      "the first step's closed form away from the layer; at every k no overshoot beyond the projection of the jump; with damping none above 1.27",
+      "eight permeabilities, iterative.opts")
 def tight(lab):
     """The layer that drains in the first step is thinner than a cell. P2–P1 is inf-sup stable, so the pressure stays
     bounded, but a jump that the mesh cannot show leaves ripples beside it (Vermeer & Verruijt 1981)."""
@@ -82,19 +84,23 @@ def tight(lab):
             if e != -6:
                 continue
             lab.above(f"k = 1e-6{damped}: least p/p0", p[vertices].min(), -1e-9)
-            if damped or not lab.small:
-                lab.below(f"k = 1e-6{damped}: largest p/p0 (1.27: P1 in one dimension)", p[vertices].max(), 1.27)
             if not damped:
-                jump = projected(x, corners, np.abs(x[:, 0] - length) < 1e-6)
+                jump = projected(x, corners, np.abs(x[:, 0] - length) < 1e-6)[vertices].max()
                 lab.within("k = 1e-6: largest p/p0 beside that of the P1 projection of the jump (the mesh's, no instability)",
-                           p[vertices].max(), jump[vertices].max(), 0.01)
+                           p[vertices].max(), jump, 0.01)
             order = vertices[np.argsort(x[vertices, 0])]
             lab.curves["profile" + damped] = [x[order, 0].tolist(), p[order].tolist()]
         lab.curves["overshoot" + damped] = overshoots
+        if overshoots:
+            _, high, low = np.array(overshoots).T
+            if damped or not lab.small:
+                lab.below(f"all k{damped}: largest p/p0 (1.27: P1 in one dimension)", high.max(), 1.27)
+            if not damped:
+                lab.below("all k: largest p/p0 over that of the projected jump", high.max() / jump, 1.01)
+            lab.above(f"all k{damped}: least p/p0", low.min(), -1e-6)
     if (-6, " damped") in errors and (4, " damped") in errors:
         lab.below("k = 1e-6: rms error of p with -pressure_damping over that without", errors[-6, " damped"] / errors[-6, ""], 1)
-        lab.below("its cost at k = 1e4: rms error of p/p0 with it", errors[4, " damped"], 1e-3)
-        lab.demand("k = 1e4: rms error of p/p0 without", errors[4, ""], "for comparison", True)
+        lab.below(f"its cost at k = 1e4: rms error of p/p0 with it (without: {errors[4, '']:.3g})", errors[4, " damped"], 1e-3)
     if not lab.small:
         breath = pulmo.DIRECT + pulmo.PCV + pulmo.LUNG + ["-ts_max_time", 0.5]
         plain, damped = lab.finished(breath, "breath"), lab.finished(breath + ["-pressure_damping"], "breath, damped")
@@ -111,7 +117,8 @@ def tight(lab):
                           run.json()["mass_balance_error_ml"], 1e-6)
 
 
-@case("Very high permeability: 10¹⁰")
+@case("Very high permeability: 10¹⁰", "the lung without airflow, as 1/k; no step cut; Krylov count",
+      "volume control")
 def open_tissue(lab):
     """The pressure is uniform to 10 digits: the flux is a large number times a small gradient."""
     controls = [("pressure control", pulmo.PCV, [])]
@@ -140,7 +147,7 @@ def open_tissue(lab):
                       run.json()["krylov_iterations"] / run.json()["newton_iterations"], 15 if scene is pulmo.PCV else 30)
 
 
-@case("Permeability and stiffness jumps of 10⁶ between regions")
+@case("Permeability and stiffness jumps of 10⁶ between regions", "closed forms of two halves in series")
 def jumps(lab):
     """Collapsed beside open tissue: coefficients of one matrix six decades apart across one face. pulmo has no parameters by
     region yet; a test effect adds them (tests/cases/jumps.cpp)."""
@@ -148,14 +155,16 @@ def jumps(lab):
     if not program.exists():
         lab.demand("the test program", "not built", str(program.name), False)
         return
-    run = subprocess.run([program], cwd=pulmo.SOURCE, env=pulmo.ENVIRONMENT, capture_output=True, text=True, timeout=300)
+    run = lab.counted(lambda: subprocess.run([program], cwd=pulmo.SOURCE, env=pulmo.ENVIRONMENT, capture_output=True, text=True,
+                                             timeout=300))
     for line in run.stdout.splitlines():
         if line.startswith("demand "):
             lab.demands.append(json.loads(line[7:]))
     lab.demand("all its assertions", "hold" if run.returncode == 0 else "fail", "hold", run.returncode == 0)
 
 
-@case("Undrained limit: a beam that cannot change its volume")
+@case("Undrained limit: a beam that cannot change its volume", "Timoshenko's tip, with one cube over the height too; the tip converges with the mesh",
+      "the finest mesh with its rates; of the skeleton of ν = 0.4995 Timoshenko's tip")
 def undrained(lab):
     """Air that cannot leave makes the tissue incompressible: elements that lock are too stiff by factors in bending.
     (Cook's membrane and its rates: tests/verification.)"""
@@ -168,53 +177,56 @@ def undrained(lab):
     soft = ["-tissue", "yoshihara"]
     rigid = ["-tissue", "berger", "-tissue_mu", mu, "-tissue_lambda", 1e3 * mu, "-tissue_phi0", 1]
     gas = ["-airflow", "-airflow_surfaces", "x1", "-airflow_permeability", 1e-12]
-    scenes = [("drained", soft, nu), ("undrained", soft + gas, 0.5)]
-    if not lab.small:
-        scenes.append(("skeleton of ν = 0.4995, drained", rigid, 1e3 / (2 * (1e3 + 1))))
-    def bent(law, n, load, name, more=()):
+    # where volume is 10³ times as stiff as shape the search for a smaller residual allows crawling steps only, and whole Newton
+    # steps are the way
+    scenes = [("drained", soft, nu, counts), ("undrained", soft + gas, 0.5, counts),
+              ("skeleton of ν = 0.4995, drained, -snes_linesearch_type basic", rigid + ["-snes_linesearch_type", "basic"],
+               1e3 / (2 * (1e3 + 1)), counts[1:] if lab.small else counts)]
+
+    def bent(law, n, load, name):
         return lab.finished(pulmo.DIRECT + meshes.box_options(n, (length, width, width)) + law + [
             "-support", "-support_surfaces", "x0", "-traction", "-traction_surfaces", "x1", "-traction_value", f"0,0,{load / width**2}",
-            "-ts_dt", 1, "-ts_max_time", 1, *more], name)
+            "-ts_dt", 1, "-ts_max_time", 1], name)
 
     def tip_of(run):
-        x, _, values = fields(run)
+        x, _, values = pulmo.fields(run)
         return values["displacement"].reshape(-1, 3)[np.abs(x[:, 0] - length) < 1e-9, 2].mean()
 
-    for name, law, poisson in scenes:
+    for name, law, poisson, meshes_of in scenes:
         E = 2 * mu * (1 + poisson)
         exact = force * length**3 / (3 * E * inertia) + force * length / (mu * shear_area)
-        for n in counts:
+        for n in meshes_of:
             run = bent(law, n, force, f"{name}, {n}")
             if run:
                 tip[name, n] = tip_of(run) / exact
-        if (name, counts[-1]) in tip:
+        if (name, counts[-1]) in tip and (law[1] != "berger" or not lab.small):
             lab.within(f"{name}: tip over Timoshenko's beam, {counts[-1][0]} × {counts[-1][1]} × {counts[-1][2]} cubes",
                        tip[name, counts[-1]], 1, 0.05 if lab.small else 0.03)
             lab.above(f"{name}: the same with one cube over the height", tip[name, counts[0]], 0.9)
-    # ten times the load at once: the dead load is cut with the first step; where volume is 10³ times as stiff as shape the
-    # search for a smaller residual allows crawling steps only, and whole Newton steps are the way
-    for name, law, poisson, more in (("drained", soft, nu, ()),
-                                     ("skeleton of ν = 0.4995", rigid, 1e3 / (2 * (1e3 + 1)), ("-snes_linesearch_type", "basic"))):
-        E = 2 * mu * (1 + poisson)
-        exact = 10 * force * length**3 / (3 * E * inertia) + 10 * force * length / (mu * shear_area)
-        run = bent(law, (20, 2, 2), 10 * force, f"{name}, ten times the load", more)
-        if run:
-            lab.within(" ".join((f"{name}, ten times the load, 20 × 2 × 2 cubes: tip over Timoshenko's beam", *more)), tip_of(run) / exact, 1, 0.05)
+        if not lab.small and all((name, n) in tip for n in counts):
+            a, b, c = (tip[name, n] for n in counts)
+            lab.above(f"{name}: rate of the tip, from 1, 2 and 4 cubes over the height ({a:.4f}, {b:.4f}, {c:.4f})",
+                      np.log2((b - a) / (c - b)), 1.5)
+        # ten times the load at once: the dead load is cut with the first step; what the mesh lacks is the same
+        run = bent(law, counts[1], 10 * force, f"{name}, ten times the load") if "undrained" not in name else None
+        if run and (name, counts[1]) in tip:
+            lab.within(f"{name}: tip under ten times the load over ten times the tip, 20 × 2 × 2 cubes", tip_of(run) / exact / 10, tip[name, counts[1]], 0.01)
 
 
-@case("Stretched cells (100 : 1), slivers, cells with all nodes on the boundary")
+@case("Stretched cells (100 : 1), slivers, cells with all nodes on the boundary",
+      "the first step's closed form within 2 % rms; order of the plates; Krylov count", "finer plates, 200 : 1, Krylov counts")
 def bad_cells(lab):
     """Gradients across flat cells cancel, smoothers and AMG see couplings 10⁴ apart, and a cell without an inner node has
     little freedom."""
     length, k, n = 1.0, 1 / MODULUS, 10  # c_v = 1 mm²/s
     dt = 0.05
     flat = meshes.box((n, 3, 3), (length, 0.3, 0.3), flatten=0.93)
-    facets = meshes.boundary(flat[1])
+    facets = case_meshes.boundary(flat[1])
     lab.below("quality of the flattest sliver (1: regular)", meshes.quality(*flat), 1e-2)
     columns = {"cubes": meshes.box_options((n, 2, 2), (length, 0.2, 0.2)),
                "plates 100 : 1": meshes.box_options((n, 2, 2), (length, 20, 20)),
                "plates 100 : 1, finer": None if lab.small else meshes.box_options((2 * n, 4, 4), (length, 20, 20)),
-               "slivers": meshes.write(*flat, facets, meshes.faces_of_box(flat[0], facets, (length, 0.3, 0.3))),
+               "slivers": case_meshes.write(*flat, facets, case_meshes.faces_of_box(flat[0], facets, (length, 0.3, 0.3))),
                "no inner node": meshes.box_options((n, 1, 1), (length, 0.1, 0.1))}
     errors = {}
     for name, mesh in columns.items():
@@ -239,13 +251,13 @@ def bad_cells(lab):
                      "plates 200 : 1, iterative")
     # one cube of six cells, all nodes on its boundary
     points, tets = meshes.box((1, 1, 1), (10, 10, 10))
-    facets = meshes.boundary(tets)
-    faces = ["airway" if f == "x1" else "pleura" for f in meshes.faces_of_box(points, facets, (10, 10, 10))]
-    run = lab.finished(pulmo.DIRECT + pulmo.PCV + meshes.write(points, tets, facets, faces) + [
+    facets = case_meshes.boundary(tets)
+    faces = ["airway" if f == "x1" else "pleura" for f in case_meshes.faces_of_box(points, facets, (10, 10, 10))]
+    run = lab.finished(pulmo.DIRECT + pulmo.PCV + case_meshes.write(points, tets, facets, faces) + [
         "-tissue", "yoshihara", "-airflow_permeability", 100, "-ts_max_time", 1], "six cells, a breath")
     if run:
         lab.below("six cells: energy balance, residual over work", run.json()["energy_j"]["residual_relative"], 1e-8)
-    run = lab.finished(pulmo.DIRECT + pulmo.STILL + pulmo.PINS + meshes.write(points, tets, facets, faces) + [
+    run = lab.finished(pulmo.DIRECT + pulmo.STILL + pulmo.PINS + case_meshes.write(points, tets, facets, faces) + [
         "-tissue", "yoshihara", "-ventilator", "pcv", "-ventilator_pip", 12, "-ventilator_ramp", 1, "-ts_max_time", 1], "free")
     if run:
         lab.within("six cells: J at 12 cmH2O, free", run.signals()["max_J"][-1], inflated("yoshihara", 12, 1, 2.53), 1e-7)

@@ -3,7 +3,7 @@ import math
 import random
 
 from . import meshes
-from .lab import case, first_sentence, pulmo
+from .lab import case, case_meshes, first_sentence, pulmo
 
 TISSUE = {"berger": {"mu": 0.2808, "lambda": 0.4212}, "ma": {"c": 2}, "birzle": {"c": 0.3567, "c1": 0.2782, "c3": 5.766e-3},
           "yoshihara": {"c": 1.298, "beta": 0.75}, "rausch": {"c_q": 4.1, "c_c": 20.7, "kappa": 16.5}}
@@ -46,9 +46,9 @@ def scene(dice):
     if shape == "box":
         lengths = [10 * between(dice, 0.3, 3) for _ in range(3)]
         points, tets = meshes.box([dice.randint(1, 3) for _ in range(3)], lengths)
-        facets = meshes.boundary(tets)
-        names = ["airway" if f == "x1" else "pleura" for f in meshes.faces_of_box(points, facets, lengths)]
-        options += meshes.write(points, tets, facets, names)
+        facets = case_meshes.boundary(tets)
+        names = ["airway" if f == "x1" else "pleura" for f in case_meshes.faces_of_box(points, facets, lengths)]
+        options += case_meshes.write(points, tets, facets, names)
         volume = lengths[0] * lengths[1] * lengths[2]
     else:
         options += ["-dm_plex_filename", pulmo.mesh(f"{shape}.msh")]
@@ -90,7 +90,7 @@ def scene(dice):
             "-ts_adapt_dt_min", 1e-6, "-ts_max_time", 0.8], ranks, text)
 
 
-@case("Random admissible scenes (seeded)")
+@case("Random admissible scenes (seeded)", "no crash, hang, NaN, trace or silence; nearly all finish", "185 of 200 seeds")
 def fuzz(lab):
     """Laws, parameters, meshes, springs, permeabilities, manoeuvres, steps, solvers and ranks drawn together: combinations that
     nobody thought of."""
@@ -110,7 +110,7 @@ def fuzz(lab):
             finished += 1
         else:
             stopped += 1
-    lab.demand("scenes that finished with J > 0", finished, f"most of {count}", finished > count / 2)
-    lab.demand("scenes that stopped with one clear sentence", stopped, "the rest", finished + stopped + len(faults) == count)
+    lab.demand(f"scenes that finished with J > 0 ({stopped} stopped with one clear sentence)", finished, f"≥ {0.8 * count:.0f} of {count}",
+               finished >= 0.8 * count)
     lab.demand("crash, NaN in a file, hang, PETSc trace, silence", "; ".join(faults[:6]) or "none", "none", not faults)
     lab.said = lab.said[:1]

@@ -3,28 +3,29 @@
 Every run is held to what is asked of all of them, whatever the case: it ends in time; it finishes, or it stops with one
 sentence; no accepted state has J <= 0; no file holds a number that is none.
 """
-import json
 import math
-import os
 import re
 import resource
 import sys
-import tempfile
 from pathlib import Path
 
 import h5py
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent.parent / "tests/cases"))
+import case_meshes  # noqa: E402, F401: of the cases
 import pulmo_case as pulmo  # noqa: E402
 
 CASES = {}  # name -> function, in the order of the page
 
 
-def case(title):
-    """Makes a function of a Lab a case of the gallery; its docstring says why the case is hard."""
+def case(title, asked, left_out="nothing"):
+    """Makes a function of a Lab a case of the gallery; its docstring says why the case is hard.
+
+    asked: what is demanded, in short; left_out: what the size of the tests leaves out.
+    """
     def add(function):
-        function.title = title
+        function.title, function.asked, function.left_out = title, asked, left_out
         CASES[function.__name__] = function
         return function
     return add
@@ -46,16 +47,31 @@ def first_sentence(text):
     return re.split(r"\.\s+(?=[A-Z])", said.group(1))[0] if said else ""
 
 
+# of summary.json and failure.json: numbers that every run defines. NaN is written as null there, as is a clinical number
+# that a breath does not define
+DEFINED = {"reference_volume_ml", "surface_area_mm2", "min_jacobian", "min_porosity", "mass_balance_error_ml", "end_time_s", "steps",
+           "rejected_steps", "newton_iterations", "krylov_iterations", "ventilation_ml", "jacobian_mean", "jacobian_sd",
+           "ventilator_work", "external", "elastic_tissue", "elastic_springs", "resistive", "resistive_tube",
+           "numerical_dissipation", "residual", "residual_relative"}
+
+
+def undefined(value, key=""):
+    """Keys within a JSON value that hold no number where there always is one."""
+    if isinstance(value, dict):
+        return [bad for k, v in value.items() for bad in undefined(v, k)]
+    if isinstance(value, list):
+        return [bad for v in value for bad in undefined(v, key)]
+    none = value is None and key in DEFINED or isinstance(value, float) and not math.isfinite(value)
+    return [key] if none else []
+
+
 def broken_numbers(run):
     """Names of the files of a run that hold NaN or infinity (fields: of what its mesh has)."""
     bad = []
     for name in run.files():
         path = run.path(name)
-        if name.endswith(".json"):  # null stands for a number that is not defined
-            text = Path(path).read_text()
-            json.loads(text)
-            if re.search(r"\b(nan|inf|infinity)\b", re.sub(r'"[^"]*"', "", text), re.I):
-                bad.append(name)
+        if name.endswith(".json"):
+            bad += [f"{name} ({key})" for key in undefined(run.json(name))]
         elif name.endswith((".csv", ".csv.part")):
             if re.search(r"(^|,)-?(nan|inf)(?=,|$)", Path(path).read_text(), re.I | re.M):
                 bad.append(name)
@@ -78,11 +94,17 @@ class Lab:
 
     # ---- runs
 
+    def counted(self, call):
+        """What a call returns; the CPU time of the programs that it ran goes to the case."""
+        before = children_cpu()
+        try:
+            return call()
+        finally:
+            self.cpu += children_cpu() - before
+
     def run(self, options, ranks=1, timeout=300, sound=True):
         """A run that may finish or stop; `sound`: held to what is asked of every run."""
-        before = children_cpu()
-        run = pulmo.Case(pulmo.QUIET + list(options), ranks=ranks, timeout=timeout)
-        self.cpu += children_cpu() - before
+        run = self.counted(lambda: pulmo.Case(pulmo.QUIET + list(options), ranks=ranks, timeout=timeout))
         self.runs += 1
         run.finished = run.code == 0
         run.sentence = first_sentence(run.err)
@@ -92,7 +114,7 @@ class Lab:
             numbers, rows = run.json(run.summary_file), run.signals(run.signals_file)
             self.steps += numbers["steps"]
             self.cut += numbers["rejected_steps"]
-            self.min_J = min(self.min_J, numbers["min_jacobian"])
+            self.min_J = min(self.min_J, float(rows["min_J"].min()))
             self.most_newton = max(self.most_newton, int(rows["newton_iterations"].max()))
         if not run.finished:
             self.stops += 1
@@ -122,6 +144,9 @@ class Lab:
             return "no number in " + ", ".join(bad)
         if not run.signals(run.signals_file)["min_J"].min() > 0:
             return "a row with J <= 0"
+        no_air = run.json(run.summary_file).get("min_porosity", 0) < 0
+        if no_air != ("the porosity falls below zero" in run.out):
+            return "porosity < 0 without a warning" if no_air else "a warning of porosity < 0 that is not"
         return ""
 
     def finished(self, options, what="runs to its end", **arguments):
@@ -148,14 +173,14 @@ class Lab:
 
     def within(self, what, measured, expected, share):
         """Relative to what is expected."""
-        self.demand(what, measured, f"{number(float(expected))} ± {100 * share:.3g} %",
+        self.demand(what, measured, f"{number(float(expected))} ± {number(100.0 * share)} %",
                     abs(measured - expected) <= share * abs(expected))
 
     def below(self, what, measured, limit):
-        self.demand(what, float(measured), f"< {limit:.3g}", measured < limit)
+        self.demand(what, float(measured), f"< {number(limit)}", measured < limit)
 
     def above(self, what, measured, limit):
-        self.demand(what, float(measured), f"> {limit:.3g}", measured > limit)
+        self.demand(what, float(measured), f"> {number(limit)}", measured > limit)
 
     def true(self, what, met):
         self.demand(what, "yes" if met else "no", "yes", met)
@@ -165,6 +190,8 @@ class Lab:
 
     def recovery(self):
         """What the program did to get through, or that it did not."""
+        if not self.runs:
+            return "a test program of its own"
         parts = [f"{self.cut} steps cut and grown back" if self.cut else "no step cut",
                  f"up to {self.most_newton} Newton steps in one"]
         if self.stops:
@@ -172,8 +199,9 @@ class Lab:
             parts += [f"“{s[:120]}”" for s in dict.fromkeys(self.said)][:2]
         return "; ".join(parts)
 
-    def result(self, name, title, why):
-        return {"name": name, "title": title, "why": why, "demands": self.demands, "met": self.met(), "runs": self.runs,
+    def result(self, name, function):
+        return {"name": name, "title": function.title, "why": " ".join((function.__doc__ or "").split()), "asked": function.asked,
+                "left_out": function.left_out, "demands": self.demands, "met": self.met(), "runs": self.runs,
                 "steps": self.steps, "cut": self.cut, "min_J": self.min_J if math.isfinite(self.min_J) else None,
                 "recovery": self.recovery(), "cpu_s": self.cpu, "curves": self.curves}
 
@@ -185,26 +213,13 @@ def run_case(name, program, small):
         function(lab)
     except Exception as error:  # noqa: BLE001: whatever went wrong belongs on the page
         lab.demand("the case itself runs", f"{type(error).__name__}: {error}"[:400], "no exception", False)
-    return lab.result(name, function.title, " ".join((function.__doc__ or "").split()))
-
-
-def fields(run, step=-1):
-    """Of a snapshot: mid-nodes included coordinates, cells (10 nodes each) and a reader of its values by name."""
-    names = sorted(n for n in run.files() if re.fullmatch(r"fields_\d+\.h5", n))
-    with h5py.File(run.path("fields.h5")) as file:
-        x, cells = file["geometry"][:], file["topology"][:].reshape(-1, 10)
-    with h5py.File(run.path(names[step])) as file:
-        values = {name: file[name][()] for name in file if isinstance(file[name], h5py.Dataset)}
-    return x, cells, values
+    return lab.result(name, function)
 
 
 def resident(pid):
-    """Resident memory of a process, bytes; 0 if it has ended."""
+    """Resident memory of a process without that of files (programs, libraries), bytes; 0 if it has ended."""
     try:
-        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, IndexError):
+        return 1024 * int(re.search(r"RssAnon:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())[1])
+    except (OSError, TypeError):
         return 0
 
-
-def scratch(name):
-    return os.path.join(tempfile.mkdtemp(dir=pulmo._scratch.name), name)

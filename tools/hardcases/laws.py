@@ -6,6 +6,12 @@ from .lab import case, pulmo
 
 FREE = pulmo.DIRECT + pulmo.STILL + pulmo.PINS  # no airflow, no springs: F = J^(1/3) I, p = dW/dJ
 LAWS = ["berger", "ma", "birzle", "yoshihara", "rausch"]
+FOLDS = ("The tissue turned inside out: J = ", "in the cell at (")
+
+
+def says_where(run):
+    """Whether a run that stopped says where the tissue folds."""
+    return all(words in run.err for words in FOLDS)
 
 
 def inflated(law, pressure, low, high):
@@ -20,7 +26,8 @@ def limit_point():
     return top.x, -top.fun
 
 
-@case("Near-collapse: suction of 20 cmH2O, and far beyond")
+@case("Near-collapse: suction of 20 cmH2O, and far beyond", "closed forms of J, also of CM1 at 2000 cmH2O; the porosity and the warning when it is negative",
+      "the lung with CM2, CM4 and CM5")
 def suction(lab):
     """J falls towards 1 − Φ0, where no air is left. CM2 to CM5 have no barrier there: nothing in the model keeps the
     porosity positive, so pulmo has to say when it is not."""
@@ -30,6 +37,12 @@ def suction(lab):
         if run:
             J = inflated(law, -20, 0.0101 if law == "berger" else 1e-3, 1)
             lab.within(f"J of {law}, free", run.signals()["min_J"][-1], J, 1e-6)
+    # the barrier of CM1: J − (1 − Φ0) beside its closed form
+    run = lab.finished(FREE + pulmo.BLOCK + ["-tissue", "berger"] + pulmo.programme("suction 1 pressure -2000 ramp 1"),
+                       "berger at −2000 cmH2O")
+    if run:
+        lab.within("J − (1 − Φ0) of berger at −2000 cmH2O, free", run.signals()["min_J"][-1] - 0.01,
+                   inflated("berger", -2000, 0.0101, 1) - 0.01, 1e-6)
     lung = pulmo.DIRECT + pulmo.SCENE + pulmo.LUNG + pulmo.programme("suction 0.3 pressure -20 ramp 0.2")
     for law in ["birzle"] if lab.small else ["ma", "birzle", "yoshihara", "rausch"]:
         lab.finished(lung + ["-tissue", law], f"lung with springs and airflow, {law}")
@@ -53,7 +66,7 @@ def suction(lab):
         "a warning if J < 1 − Φ0", empty == ("porosity falls below zero" in flat.out))
 
 
-@case("Limit point of CM4: no equilibrium above 16.83 cmH2O")
+@case("Limit point of CM4: no equilibrium above 16.83 cmH2O", "stops at the closed form's maximum and says so; flow control passes along the closed form")
 def limit(lab):
     """Unrestrained Yoshihara tissue holds at most 16.83 cmH2O; above there is no state to converge to. Prescribed volume
     goes on where pressure cannot."""
@@ -85,7 +98,8 @@ def limit(lab):
         lab.within("volume delivered (ml)", gas.signals()["volume_ml"][-1], 2500, 1e-9)
 
 
-@case("Neutral plateau of CM3 near 5.03 cmH2O")
+@case("Neutral plateau of CM3 near 5.03 cmH2O", "pressures along the closed form, to 10⁻⁶ cmH2O",
+      "Δt 0.05 and 0.02 s, the jump, the lung")
 def plateau(lab):
     """dp/dJ of unrestrained Birzle tissue falls to 10⁻⁵ of its value at rest: J moves from 2 to 3 while the pressure
     changes by a hundredth of a cmH2O, and Newton overshoots by factors."""
@@ -112,13 +126,13 @@ def plateau(lab):
                      "lung with springs and airflow at 5.03 cmH2O")
 
 
-@case("CM2's exponential at large stretch")
+@case("CM2's exponential at large stretch", "J of the closed form, after a ramp and after a jump", "the ramp to 10000 cmH2O")
 def exponential(lab):
     """exp(g (J^(2/3) − 1)²) overflows for J above some 230: a Newton step too far makes infinity, and a line search that
     believes it loses the state."""
-    for pressure in [100, 1000] if lab.small else [100, 1000, 10000]:
+    for pressure in [100, 1000, 10000]:
         J = inflated("ma", pressure, 1, 100)
-        for ramp in [1] if lab.small else [1, 0]:
+        for ramp in [0] if lab.small and pressure == 10000 else [1, 0]:
             run = lab.finished(FREE + pulmo.BLOCK + ["-tissue", "ma", "-ventilator", "pcv", "-ventilator_pip", pressure,
                                                      "-ventilator_ramp", ramp, "-ts_max_time", 1 if ramp else 0.1],
                                f"{pressure} cmH2O " + ("in 1 s" if ramp else "in one step"))
@@ -126,7 +140,7 @@ def exponential(lab):
                 lab.within(f"J at {pressure} cmH2O, " + ("ramp" if ramp else "one step"), run.signals()["max_J"][-1], J, 1e-6)
 
 
-@case("CM5's zero shear modulus at F = I")
+@case("CM5's zero shear modulus at F = I", "J of the closed form; no step cut; energy balance", "0.8 s of the lung's breath")
 def no_shear(lab):
     """Rausch's isochoric energy grows with the fourth power of the shear strain: the tangent at rest is singular in
     shear, and Newton converges linearly at best."""
@@ -137,12 +151,13 @@ def no_shear(lab):
     run = lab.finished(lung + ["-ts_max_time", 0.2 if lab.small else 1], "lung with springs and airflow")
     if run:
         rows = run.signals()
-        lab.true("most Newton steps of a step within -snes_max_it (30)", rows["newton_iterations"].max() <= 30)
+        lab.below("most Newton steps of a step", rows["newton_iterations"].max(), 20)
         lab.demand("steps cut", run.json()["rejected_steps"], "0", run.json()["rejected_steps"] == 0)
         lab.below("energy balance, residual over work", run.json()["energy_j"]["residual_relative"], 1e-8)
 
 
-@case("CM1 at the airway's rim with the paper's traction")
+@case("CM1 at the airway's rim with the paper's traction", "finishes, or stops and says which cell turned inside out",
+      "the whole breath, the lung at 20 cmH2O")
 def rim(lab):
     """Without gas pressure on the airway wall soft tissue swells into the airway and folds at its rim: a code that trusts
     Newton's convergence accepts J < 0 there."""
@@ -150,18 +165,19 @@ def rim(lab):
     run = lab.run(berger + pulmo.LUNG + ["-ts_max_time", 0.3])
     lab.demand("6 cmH2O, the paper's traction", f"finished, min J {run.json()['min_jacobian']:.3g}" if run.finished else
                "stopped: " + run.sentence, "finishes with min J > 0, or says where it folds",
-               run.finished or "no step could be accepted" in run.err)
+               run.finished or says_where(run))
     lab.finished(berger + pulmo.LUNG + ["-lumen_pressure", "-ts_max_time", 0.3 if lab.small else 1.5],
                  "the same with -lumen_pressure")
     lab.stopped(berger + pulmo.CUBE + ["-ventilator_pip", 40, "-airflow_permeability", 10, "-ts_max_time", 0.3],
-                "converged to a state with J <= 0", "The tissue turned inside out", "-lumen_pressure",
+                "converged to a state with J <= 0", *FOLDS, "-lumen_pressure",
                 what="a cube at 40 cmH2O, where Newton converges to J < 0")
     if not lab.small:
         lab.stopped(berger + pulmo.LUNG + ["-ventilator_pip", 20, "-ts_adapt_dt_min", 1e-3, "-ts_max_time", 0.3],
-                    "The tissue turned inside out", what="the lung at 20 cmH2O")
+                    *FOLDS, what="the lung at 20 cmH2O")
 
 
-@case("Volume control of the soft laws CM1 and CM2")
+@case("Volume control of the soft laws CM1 and CM2", "the volume set, to 10⁻⁹; finishes, or says which cell turned inside out",
+      "the whole breath, the paper's traction")
 def soft_volume_control(lab):
     """The prescribed flux is pushed through the airway's own tissue, which inflates first: CM1 and CM2 fold at the rim
     under the paper's traction."""
@@ -176,4 +192,4 @@ def soft_volume_control(lab):
         if not lab.small:
             bare = lab.run(vcv + ["-tissue", law])
             lab.demand(f"{law}, the paper's traction", "finished" if bare.finished else "stopped: " + bare.sentence,
-                       "finishes, or says where it folds", bare.finished or "no step could be accepted" in bare.err)
+                       "finishes, or says where it folds", bare.finished or says_where(bare))

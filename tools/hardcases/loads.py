@@ -4,24 +4,31 @@ from pathlib import Path
 
 import numpy as np
 
-import airway_test
-
-from . import meshes
-from .lab import case, pulmo, resident
+from .lab import case, case_meshes, pulmo, resident
 from .laws import inflated
 
 REUSE = pulmo.options_file("solvers/reuse.opts")
 ITERATIVE = pulmo.options_file("solvers/iterative.opts")
+# bytes that a step leaves in memory: SignalRow, EnergyBalance with six accounts, and RegionState with one region (vectors of their own)
+ROW = 152 + (48 + 64) + (24 + 48)
 
 
-@case("40 cmH2O in one step")
+@case("A jump to 40 cmH2O", "pressure reaches 40 cmH2O by the end of the first 50 ms, cut or not; V beside rest (small) or half the step",
+      "the lung, the other four laws, -lumen_pressure, halved steps")
 def jump(lab):
-    """The whole pressure meets a lung at rest in its first step: no equilibrium is near the start of Newton's method, and
-    with no ramp a shorter step makes the jump no smaller; only the flow limits what happens in it."""
+    """The whole pressure meets a lung at rest in its first step (50 ms): no equilibrium is near the start of Newton's method.
+    A step that has to be cut takes a share of the jump only, a linear rise within the 50 ms (docs/ventilator.md)."""
+    def jumped(name, run):
+        rows = run.signals()
+        lab.below(f"{name}: pressure beside a rise within the first 50 ms, cut or not (cmH2O)",
+                  np.abs(rows["airway_pressure_cmH2O"] - 40 * np.minimum(1, rows["time_s"] / 0.05)).max(), 1e-9)
+
     if lab.small:
         cube = pulmo.DIRECT + pulmo.PCV + pulmo.CUBE + ["-tissue", "rausch", "-ventilator_pip", 40, "-airflow_permeability", 1e4]
         once = lab.finished(cube + ["-ventilator_ramp", 0, "-ts_max_time", 0.3], "rausch on a cube")
         still = lab.finished(cube + ["-ventilator_ramp", 0.3, "-ts_max_time", 0.3, "-airflow", "off"], "at rest")
+        if once:
+            jumped("rausch on a cube", once)
         if once and still:
             lab.within("V beside that at rest (ml)", once.signals()["volume_ml"][-1], still.signals()["volume_ml"][-1], 1e-6)
         return
@@ -30,28 +37,33 @@ def jump(lab):
         scene = pulmo.DIRECT + pulmo.PCV + pulmo.LUNG + ["-ventilator_pip", 40, "-tissue", law] + ["-lumen_pressure"] * wall
         once = lab.finished(scene + ["-ventilator_ramp", 0, "-ts_max_time", 0.3], name)
         if once:
+            jumped(name, once)
             fine = lab.finished(scene + ["-ventilator_ramp", 0, "-ts_max_time", 0.3, "-ts_dt", 0.025], f"{name}, Δt halved")
             if fine:
                 lab.within(f"{name}: V after 0.3 s beside that of half the step (ml)", once.signals()["volume_ml"][-1],
                            fine.signals()["volume_ml"][-1], 0.02)
 
 
-@case("Square flow of 500 ml in 50 ms")
+@case("Square flow of 500 ml in 50 ms", "the volume set is in, to 10⁻⁹; what it comes to does not depend on the step",
+      "the lung (a cube instead), CM2 and CM3, the smaller step")
 def flood(lab):
     """10 l/s through an airway of 7 cm² into a lung of 1350 ml, in one step or in ten: twenty times the usual flow."""
-    for law in ["yoshihara"] if lab.small else ["ma", "birzle", "yoshihara"]:
-        for dt in [0.05] if lab.small or law != "yoshihara" else [0.05, 0.005]:
-            mesh = ["-dm_plex_filename", pulmo.mesh("cube_lung.msh"), "-mesh_scale", 11] if lab.small else pulmo.LUNG
-            run = lab.finished(pulmo.DIRECT + pulmo.VCV + mesh + [
-                "-tissue", law, "-ventilator_inspiration", 0.05, "-ts_dt", dt, "-ts_max_time", 0.1, "-lumen_pressure"],
-                f"{law}, Δt {dt} s")
-            if run:
-                rows = run.signals()
-                at = int(np.abs(rows["time_s"] - 0.05).argmin())
-                lab.within(f"volume in after 50 ms, {law}, Δt {dt} s (ml)", rows["volume_ml"][at], 500, 1e-9)
+    mesh = ["-dm_plex_filename", pulmo.mesh("cube_lung.msh"), "-mesh_scale", 11] if lab.small else pulmo.LUNG
+    largest = {}
+    for law, dt in [("yoshihara", 0.05)] if lab.small else [("ma", 0.05), ("birzle", 0.05), ("yoshihara", 0.05), ("yoshihara", 0.005)]:
+        run = lab.run(pulmo.DIRECT + pulmo.VCV + mesh + [
+            "-tissue", law, "-ventilator_inspiration", 0.05, "-ts_dt", dt, "-ts_max_time", 0.1, "-lumen_pressure"])
+        lab.demand(f"{law}, Δt {dt} s", "finished" if run.finished else f"stopped: {run.sentence}", "finished", run.finished)
+        rows = run.signals(run.signals_file)
+        largest[law, dt] = rows["airway_pressure_cmH2O"].max()
+        if rows["time_s"][-1] > 0.05 - 1e-9:
+            at = int(np.abs(rows["time_s"] - 0.05).argmin())
+            lab.within(f"volume in after 50 ms, {law}, Δt {dt} s (ml)", rows["volume_ml"][at], 500, 1e-9)
+    if not lab.small:
+        lab.within("largest pressure, yoshihara, first step 50 ms beside 5 ms (cmH2O)", largest["yoshihara", 0.05], largest["yoshihara", 0.005], 0.01)
 
 
-@case("Time steps from 10⁻⁵ to 1 s")
+@case("Time steps from 10⁻⁵ to 1 s", "first order in Δt; the volume at rest, to 10⁻⁶", "Δt = 10⁻⁵ s")
 def steps(lab):
     """The mass balance is ill conditioned for tiny steps (the flow hides behind storage) and stiff for long ones."""
     lung = pulmo.DIRECT + pulmo.PCV + pulmo.CUBE + ["-tissue", "yoshihara", "-airflow_permeability", 30, "-ventilator_ramp", 0.01]
@@ -72,7 +84,8 @@ def steps(lab):
                        still.signals()["volume_ml"][-1], 1e-6)
 
 
-@case("Springs: K_s = 0 and K_s = 10⁴ kPa/mm")
+@case("Springs: K_s = 0 and K_s = 10⁴ kPa/mm", "free motions refused; closed forms without springs and for stiff ones; Krylov count",
+      "the lung (a cube instead)")
 def springs(lab):
     """Without springs six rigid motions are free; with springs of 10⁵ times the usual stiffness the surface rows outweigh the
     tissue's by six decades."""
@@ -111,7 +124,8 @@ def breath(name, size, more):
     return pulmo.PCV + common
 
 
-@case("The same lung as a mouse's (0.1), three times as large, and in metres")
+@case("The same lung as a mouse's (0.1), three times as large, and in metres", "P, V/size³ and J the same to 10⁻¹⁰, Newton and Krylov counts",
+      "the lung (a cube instead)")
 def scales(lab):
     """Dimensional slips and absolute tolerances show: with k ∝ size² and K_s ∝ 1/size the problem is the same, so are
     iteration counts, pressures, J, and volumes over size³."""
@@ -121,12 +135,12 @@ def scales(lab):
         for solver, file in (("direct", pulmo.DIRECT), ("iterative", ITERATIVE)):
             def run(size, mesh_options):
                 return lab.finished(file + mesh_options + breath(kind, size, []), f"{kind}, {solver}, size {size}")
-            one = run(1, meshes.scaled(mesh, base))
+            one = run(1, case_meshes.scaled(mesh, base))
             if one is None:
                 continue
             reference, counts = one.signals(), one.json()
-            for size, options in ((0.1, meshes.scaled(mesh, 0.1 * base)), (3, meshes.scaled(mesh, 3 * base)),
-                                  (1, meshes.scaled(mesh, base / 1000) + ["-mesh_scale", 1000])):
+            for size, options in ((0.1, case_meshes.scaled(mesh, 0.1 * base)), (3, case_meshes.scaled(mesh, 3 * base)),
+                                  (1, case_meshes.scaled(mesh, base / 1000) + ["-mesh_scale", 1000])):
                 name = "in metres" if size == 1 else f"× {size}"
                 other = run(size, options)
                 if other is None:
@@ -137,20 +151,21 @@ def scales(lab):
                     ("airway_pressure_cmH2O", 1), ("volume_ml", size**3), ("min_J", 1))) if same else np.inf
                 lab.below(f"{kind}, {solver}, {name}: largest relative difference of P, V, J", worst,
                           1e-10 if solver == "direct" else 1e-6)
-                # rounding may tip one Newton step at the tolerance
-                spare = abs(numbers["newton_iterations"] - counts["newton_iterations"])
-                spare_krylov = abs(numbers["krylov_iterations"] - counts["krylov_iterations"])
+                # no power of two: rounding may tip a step at the tolerance
+                newton, krylov = (abs(numbers[key] - counts[key]) for key in ("newton_iterations", "krylov_iterations"))
                 lab.demand(f"{kind}, {solver}, {name}: Newton and Krylov iterations",
                            f"{numbers['newton_iterations']}, {numbers['krylov_iterations']}",
-                           f"{counts['newton_iterations']}, {counts['krylov_iterations']}", spare == 0 and spare_krylov == 0)
+                           f"{counts['newton_iterations']} ± 1, {counts['krylov_iterations']} ± 2 %",
+                           newton <= 1 and krylov <= 0.02 * counts["krylov_iterations"])
 
 
-@case("Two lungs of very different stiffness on one windpipe")
+@case("Two lungs on springs of very different stiffness, one windpipe", "the volume set; each alone under the pressure found takes what it took",
+      "uniform flow, iterative.opts")
 def two_lungs(lab):
-    """With springs a million times apart the stiff lung is nearly rigid: the one airway pressure is fixed by the soft lung
-    alone, and a bordered Newton step with a poor pressure would push all the gas into the wrong one."""
+    """With springs a million times apart the stiff lung only opens at its airway and inwards, and strains a sixth of the soft one:
+    a bordered Newton step with a poor pressure would push all the gas into the wrong one."""
     K = {"stiff": 1e2, "soft": 1e-4}
-    files = {names: airway_test.bodies(*names) for names in (("stiff", "soft"), ("stiff",), ("soft",))}
+    files = {names: case_meshes.bodies(*names) for names in (("stiff", "soft"), ("stiff",), ("soft",))}
 
     def scene(*names):
         held = ["-chest_wall_surfaces", ",".join(names)]
@@ -158,31 +173,33 @@ def two_lungs(lab):
             held += [f"-chest_wall_stiffness_{name}", K[name]]
         return pulmo.TIGHT + pulmo.SCENE + held + files[names] + ["-airflow_permeability", 2e3]
 
-    both = lab.finished(scene("stiff", "soft") + airway_test.TwoBodies.FLOW + pulmo.COMMON, "common pressure")
+    both = lab.finished(scene("stiff", "soft") + pulmo.FLOW_OF_TWO + pulmo.COMMON, "common pressure")
     if both is None:
         return
     rows = both.signals()
     lab.within("volume in (ml)", rows["volume_ml"].max(), 40, 1e-9)
-    alone = {name: lab.finished(scene(name) + airway_test.replay(rows), f"{name} alone") for name in K}
+    alone = {name: lab.finished(scene(name) + pulmo.replay(rows), f"{name} alone") for name in K}
     if all(alone.values()):
         volume = {name: run.signals()["volume_ml"] for name, run in alone.items()}
         lab.below("each alone under the pressure found: sum of volumes − both (ml)",
                   np.abs(volume["stiff"] + volume["soft"] - rows["volume_ml"]).max(), 4e-8)
         strain = {name: v.max() / {"stiff": 125, "soft": 64}[name] for name, v in volume.items()}
-        lab.above("strain of the soft lung over that of the stiff", strain["soft"] / strain["stiff"], 1.5)
+        lab.above("strain of the soft lung over that of the stiff", strain["soft"] / strain["stiff"], 5)
     for name, options in {} if lab.small else {"uniform": pulmo.UNIFORM, "iterative": pulmo.COMMON}.items():
         more = ITERATIVE[1:] if name == "iterative" else []
         run = lab.finished(scene("stiff", "soft") + (["-options_file"] + more if more else []) +
-                           airway_test.TwoBodies.FLOW + options, name)
+                           pulmo.FLOW_OF_TWO + options, name)
         if run:
             lab.within(f"volume in, {name} (ml)", run.signals()["volume_ml"].max(), 40, 1e-9)
 
 
-@case("A thousand breaths")
+@case("A thousand breaths", "no drift of volumes to 10⁻⁸ V0; mass and energy balance of the whole run; memory: the rows of the signals and no more",
+      "970 breaths, memory")
 def breaths(lab):
-    """What leaks or drifts a little per breath adds up: volume, memory, the clock of the phases."""
+    """What leaks or drifts a little per breath adds up: volume, memory, the clock of the phases. Newton's tolerance is 10⁻¹²
+    here, so that its own sum stays below what is asked: with the 10⁻⁸ of reuse.opts 30 breaths lose 1.4·10⁻⁷ V0 of mass balance."""
     count = 30 if lab.small else 1000
-    scene = REUSE + pulmo.SCENE + pulmo.CUBE + ["-airflow_permeability", 1e3, "-ts_dt", 0.5, "-output_fields_every", 1e9] + \
+    scene = REUSE + ["-snes_rtol", 1e-12, "-snes_atol", 1e-12] + pulmo.SCENE + pulmo.CUBE + ["-airflow_permeability", 1e3, "-ts_dt", 0.5, "-output_fields_every", 1e9] + \
         pulmo.programme(f"repeat {count}\n inspiration 0.5 pressure 6\n expiration 2 pressure 0\nend\n")
     samples, done = [], threading.Event()
 
@@ -208,15 +225,17 @@ def breaths(lab):
     V0 = run.json()["reference_volume_ml"]
     volume = rows["volume_ml"][ends]
     lab.below("drift of the end-expiratory volume over V0", np.abs(volume[5:] - volume[5]).max() / V0, 1e-8)
-    peaks = rows["volume_ml"][[i - 4 for i in ends]]
+    peaks = np.array([breath.max() for breath in np.split(rows["volume_ml"], ends)[:len(ends)]])
     lab.below("drift of the peak volume over V0", np.abs(peaks[5:] - peaks[5]).max() / V0, 1e-8)
-    lab.below("mass balance over V0, per step", run.json()["mass_balance_error_ml"] / V0 / run.json()["steps"], 1e-8)
+    lab.below("mass balance over V0, largest sum over the run", run.json()["mass_balance_error_ml"] / V0, 1e-8)
     lab.below("energy balance, residual over work", run.json()["energy_j"]["residual_relative"], 1e-7)
+    if lab.small:
+        return
     sizes = np.array(samples)
-    if not lab.small and len(sizes) > 50:
-        settled = sizes[len(sizes) // 10:]
-        steps_taken = run.json()["steps"] * 0.9
-        lab.curves["memory"] = [np.linspace(0, count, len(sizes)).tolist()[::max(1, len(sizes) // 200)],
-                                (sizes / 1e6).tolist()[::max(1, len(sizes) // 200)]]
-        # each step adds a row of the signals, of the energy and of each region: some 0.5 kB
-        lab.below("memory gained per step after the first tenth (kB)", (settled[-3:].mean() - settled[:3].mean()) / steps_taken / 1e3, 1)
+    lab.above("samples of its memory", len(sizes), 50)
+    if len(sizes) > 50:
+        tenth = len(sizes) // 10  # not the first, in which it sets up, nor the last, in which it gives its memory back
+        gained = (np.median(sizes[8 * tenth:9 * tenth]) - np.median(sizes[tenth:2 * tenth])) / (0.7 * run.json()["steps"])
+        # kept until the end, for summary.json and for checkpoints: a row of signals, energy and regions per step
+        lab.demand("memory gained per step, from the second to the ninth tenth of the run (bytes)", float(gained), f"< {ROW} (the row kept of each step) + 250",
+                   gained < ROW + 250)

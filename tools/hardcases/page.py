@@ -13,22 +13,20 @@ from .laws import limit_point
 HEAD = """# Hard cases
 
 `tools/hard_cases` runs them and writes this page; `ctest -L stability` runs a small size of each from the same definitions
-(`tools/hardcases`). Each demand can fail: it holds a number against a closed form, a scaling law, another
+(`tools/hardcases`); what that leaves out stands with each case. Each demand can fail: it holds a number against a closed form, a scaling law, another
 discretisation or conservation. Every run is also held to this: it ends in time; it finishes, or it stops with one sentence
-that says what to try; no accepted state has J ≤ 0; no file holds NaN; no PETSc trace. Seconds are CPU time of the runs of a
+that says what to try; no accepted state has J ≤ 0; no porosity is negative without a warning; no file holds NaN, nor null for
+a number that every run has; no PETSc trace. Seconds are CPU time of the runs of a
 case{where}; they depend on the machine.
 
 **{met} of {demands} demands are met, {cases_met} of {cases} cases in full.**{size}
 """
+STALE = "Of another program or other definitions than the rest (run `tools/hard_cases`): {names}."
 NOT_RUN = "Without a result at this size yet (run `tools/hard_cases`): {names}."
 
 
-def mended(text):
-    return text.replace("|", "\\|")
-
-
 def demand_line(d):
-    return mended(f"{'' if d['met'] else '**missed** '}{d['what']}: {d['measured']} ({d['asked']})")
+    return f"{'' if d['met'] else '**missed** '}{d['what']}: {d['measured']} ({d['asked']})"
 
 
 def short(result):
@@ -38,8 +36,8 @@ def short(result):
     return "<br>".join([f"{met} of {len(result['demands'])} met", *map(demand_line, missed)])
 
 
-def write(folder, results, missing, machine, small):
-    """`missing`: titles of the cases that have no result."""
+def write(folder, results, missing, machine, small, state):
+    """`missing`: titles of the cases that have no result; `state`: fingerprint of program and definitions."""
     folder.mkdir(parents=True, exist_ok=True)
     demands = [d for r in results for d in r["demands"]]
     text = [HEAD.format(met=sum(d["met"] for d in demands), demands=len(demands), cases=len(results),
@@ -47,13 +45,17 @@ def write(folder, results, missing, machine, small):
                         size=" **Small size: not the gallery's figures.**" if small else "")]
     if missing:
         text += [NOT_RUN.format(names="; ".join(missing)), ""]
-    header = ["case", "why it is hard", "result", "steps, cut", "min J", "recovery path", "CPU s"]
-    text += markdown(header, [[f"[{r['title']}](#{r['name']})", mended(r["why"]), short(r), f"{r['steps']}, {r['cut']}",
-                               "–" if r["min_J"] is None else f"{r['min_J']:.3g}", mended(r["recovery"]), f"{r['cpu_s']:.0f}"]
+    stale = [r["title"] for r in results if r["state"] != state]
+    if stale:
+        text += [STALE.format(names="; ".join(stale)), ""]
+    header = ["case", "why it is hard", "what is demanded", "result", "steps, cut", "min J", "recovery path", "CPU s"]
+    text += markdown(header, [[f"[{r['title']}](#{r['name']})" + " (old)" * (r["state"] != state), r["why"], r["asked"],
+                               short(r), f"{r['steps']}, {r['cut']}" if r["runs"] else "–",
+                               "–" if r["min_J"] is None else f"{r['min_J']:.3g}", r["recovery"], f"{r['cpu_s']:.0f}"]
                               for r in results])
     text += ["", *figures(folder, results), "## What is demanded, and what was measured", ""]
     for r in results:
-        text += [f'<a id="{r["name"]}"></a>', f"### {r['title']}", ""]
+        text += [f'<a id="{r["name"]}"></a>', f"### {r['title']}", "", f"The size of the tests leaves out: {r['left_out']}.", ""]
         text += markdown(["demand", "measured", "asked", ""],
                          [[d["what"], d["measured"], d["asked"], "met" if d["met"] else "**missed**"] for d in r["demands"]])
         text.append("")

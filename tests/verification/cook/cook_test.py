@@ -7,52 +7,40 @@ import os
 import sys
 import unittest
 
-import meshio
 import numpy as np
 from scipy.optimize import brentq
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 sys.path[:0] = [HERE, os.path.join(HERE, "..", "..", "cases")]
 
+import case_meshes  # noqa: E402
 import pulmo_case as pulmo  # noqa: E402
-from audit_test import FACES, block  # noqa: E402
 from output_test import read_fields  # noqa: E402
 from plane_strain import CORNERS, SHEAR, TIPS, TRACTION, Membrane  # noqa: E402
 
 LEVELS = (4, 8, 16)  # bricks along each side
 SMALL = 1e-5  # share of the load of the linear problem
-SIDES = ["clamped", "loaded", "free", "faces"]
 # a closed airway: no gas flows in or out; within the tissue next to none in the second that the step takes
 SCENE = ["-tissue", "yoshihara", "-tissue_c", SHEAR / 2, "-support", "-support_surfaces", "clamped,faces",
          "-support_components_clamped", "xyz", "-support_components_faces", "z", "-traction", "-traction_surfaces", "loaded",
          "-airflow", "-airflow_surfaces", "free", "-airflow_permeability", 1e-9, "-ts_dt", 1, "-mesh_scale", 1]
 
 
-def write_mesh(path, n):
+def mesh(n):
     """n x n x 1 bricks of six tetrahedra each."""
-    points, cells = [], []
-    block((0, 0, 0), (1, 1, 1), (n, n, 1), points, cells)
-    points, cells = np.array(points), np.array(cells)
+    points, cells = case_meshes.kuhn((n, n, 1), (1, 1, 1))
+    facets = case_meshes.boundary(cells)
+    side = {"x0": "clamped", "x1": "loaded", "y0": "free", "y1": "free", "z0": "faces", "z1": "faces"}
     x, y, z = points.T
     shape = np.stack([(1 - x) * (1 - y), x * (1 - y), x * y, (1 - x) * y], -1)
-    faces, count = np.unique(np.sort(cells[:, FACES].reshape(-1, 3), axis=1), axis=0, return_counts=True)
-    faces = faces[count == 1]
-    centre = points[faces].mean(axis=1)
-    on = np.column_stack([np.isclose(centre[:, 0], 0), np.isclose(centre[:, 0], 1), np.isclose(abs(centre[:, 1] - 0.5), 0.5),
-                          np.isclose(abs(centre[:, 2] - 0.5), 0.5)])
-    tags = [on.argmax(axis=1) + 1, np.full(len(cells), len(SIDES) + 1)]
-    names = {name: np.array([i + 1, 2]) for i, name in enumerate(SIDES)} | {"body": np.array([len(SIDES) + 1, 3])}
-    meshio.write(path, meshio.Mesh(np.column_stack([shape @ CORNERS, 48 / n * z]), [("triangle", faces), ("tetra", cells)],
-                                   field_data=names, cell_data={"gmsh:physical": tags, "gmsh:geometrical": tags}),
-                 "gmsh22", binary=False)
+    return case_meshes.write(np.column_stack([shape @ CORNERS, 48 / n * z]), cells, facets,
+                             [side[f] for f in case_meshes.faces_of_box(points, facets, (1, 1, 1))], "body")
 
 
 def run(n, share):
     """Vertical displacement at TIPS over the share of the load, mm; fails if the gas in the membrane changes."""
-    mesh = pulmo.scratch("cook.msh")
-    write_mesh(mesh, n)
     case = pulmo.finished(pulmo.DIRECT + SCENE + pulmo.programme("closed 1 hold\n") + pulmo.QUIET +
-                          ["-snes_atol", 1e-9 * share, "-traction_value", f"0,{TRACTION * share:.17g},0", "-dm_plex_filename", mesh])
+                          ["-snes_atol", 1e-9 * share, "-traction_value", f"0,{TRACTION * share:.17g},0"] + mesh(n))
     points, _, steps = read_fields(case)
     assert abs(case.signals()["volume_ml"][-1]) < 1e-8 * share * case.json()["reference_volume_ml"]
     u = steps[-1][1]["displacement"][:, 1]

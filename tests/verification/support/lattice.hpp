@@ -191,7 +191,6 @@ public:
       out << "\n";
     }
     out << "$EndElements\n";
-    cells_ = static_cast<int>(cells.size());
   }
   ~LatticeFile()
   {
@@ -202,7 +201,6 @@ public:
   LatticeFile &operator=(const LatticeFile &) = delete;
 
   std::string path() const { return path_.string(); }
-  int cells() const { return cells_; }
 
 private:
   static std::array<int, 3> triangle(const std::array<int, 4> &cell, int apex)
@@ -215,7 +213,6 @@ private:
   }
 
   std::filesystem::path path_;
-  int cells_ = 0;
 };
 
 } // namespace pulmo::test
