@@ -1,6 +1,6 @@
 /// @file
-/// Effect `traction`: dead load (kPa per reference area, fixed direction) on named surfaces, held from t = 0 on. Where the
-/// first step has to be cut the load is cut with it.
+/// Effect `traction`: dead load (kPa per reference area, fixed direction) on named surfaces, held from t = 0 on. Where
+/// the first step of a run has to be cut the load is cut with it.
 #pragma once
 
 #include "pulmo/effect.hpp"
