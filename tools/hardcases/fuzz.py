@@ -101,7 +101,7 @@ def fuzz(lab):
             run = lab.run(options, ranks=ranks, timeout=120, sound=False)
             fault = lab.fault(run)
         except AssertionError as error:
-            run, fault = None, str(error).splitlines()[0][:150]
+            run, fault = None, str(error).split(": /")[0].splitlines()[0][:150]  # without the command
         if not fault and not run.finished and "What to try: " not in run.err:
             fault = "stopped without saying what to try: " + first_sentence(run.err)[:200]
         if fault:
