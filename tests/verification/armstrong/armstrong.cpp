@@ -99,15 +99,7 @@ TEST(Armstrong, SeriesIsTheSolution)
 // Order 2 in h: that of the flat facets and of the pressure.
 TEST(Armstrong, ConvergesInSpace)
 {
-  for (const SmallStrain &k : {soft, lung}) {
-    const Series series(k);
-    const auto solve = [&](int n, int steps, std::vector<Signal> &signals) { cylinder(k, series, n, steps, signals); };
-    std::printf("  nu %.4f\n", k.poisson());
-    if (k.beta == soft.beta)
-      converge_in_space(series.modes, solve, {4, 8, 16}, 40, t_end, 4e-3);
-    else
-      converge_in_space(series.modes, solve, {4, 8}, 40, t_end, 1.3e-2);
-  }
+  converge_in_space_for_both<Series>(cylinder, 40, t_end, 4e-3, 1.3e-2);
 }
 
 TEST(Armstrong, ConvergesInTime)

@@ -77,6 +77,22 @@ inline void converge_in_space(const Modes &modes, const Solve &solve, const std:
   }
 }
 
+/// The same for both tissues, on a third mesh for the first one. Series: of a SmallStrain, with its modes;
+/// @p solve(tissue, series, cells, steps, signals) runs the problem.
+template <class Series, class SolveFor>
+void converge_in_space_for_both(const SolveFor &solve, int steps, double t_end, double soft_bound, double lung_bound)
+{
+  for (const SmallStrain &k : {soft, lung}) {
+    const Series series(k);
+    const bool third = k.beta == soft.beta;
+    std::printf("  nu %.4f\n", k.poisson());
+    converge_in_space(
+        series.modes,
+        [&](int n, int steps_of_run, std::vector<Signal> &signals) { solve(k, series, n, steps_of_run, signals); },
+        third ? std::vector<int>{4, 8, 16} : std::vector<int>{4, 8}, steps, t_end, third ? soft_bound : lung_bound);
+  }
+}
+
 /// Halves dt twice on one mesh; demands order 1 at the given @p times, and the series within @p bound in the limit.
 inline void converge_in_time(const Modes &modes, const Solve &solve, int cells, int steps, double t_end,
                              const std::vector<double> &times, double bound)
