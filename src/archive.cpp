@@ -1,7 +1,6 @@
 #include "pulmo/archive.hpp"
 
 #include <algorithm>
-#include <array>
 #include <cstdio>
 #include <filesystem>
 #include <hdf5.h>
@@ -176,8 +175,7 @@ PetscErrorCode Archive::create(const Model &model, const NodeOrder &order, std::
 PetscErrorCode Archive::open(const Model &model, const NodeOrder &order, const std::string &option,
                              const std::string &file, std::unique_ptr<Archive> &archive)
 {
-  std::array<char, 256> complaint{};
-  std::string names;
+  std::string complaint, names;
   std::vector<double> values;
   std::size_t n = 0;
 
@@ -187,12 +185,10 @@ PetscErrorCode Archive::open(const Model &model, const NodeOrder &order, const s
   archive->path_ = file;
   if (archive->root_) {
     const Quiet quiet;
-    std::string text;
-    archive->file_ = open_file(file, text);
-    text.copy(complaint.data(), complaint.size() - 1);
+    archive->file_ = open_file(file, complaint);
   }
-  PetscCallMPI(MPI_Bcast(complaint.data(), static_cast<PetscMPIInt>(complaint.size()), MPI_CHAR, 0, archive->comm_));
-  PulmoUserCheck(complaint[0] == '\0', archive->comm_, "%s %s: %s", option.c_str(), file.c_str(), complaint.data());
+  PetscCall(from_root(archive->comm_, complaint));
+  PulmoUserCheck(complaint.empty(), archive->comm_, "%s %s: %s", option.c_str(), file.c_str(), complaint.c_str());
   PetscCall(archive->text("scalar_names", names));
   PetscCall(archive->numbers("scalars", n, values));
   std::istringstream lines(names);
@@ -207,7 +203,6 @@ PetscErrorCode Archive::finish(std::vector<char> &image)
   std::string names;
   std::vector<double> values;
   std::size_t n;
-  int good;
 
   PetscFunctionBeginUser;
   for (const auto &[name, number] : scalars_) {
@@ -226,9 +221,8 @@ PetscErrorCode Archive::finish(std::vector<char> &image)
       good_ = H5Fget_file_image(file_, image.data(), image.size()) == size;
     }
   }
-  good = good_;
-  PetscCallMPI(MPI_Bcast(&good, 1, MPI_INT, 0, comm_));
-  PetscCheck(good, comm_, PETSC_ERR_LIB, "HDF5 failed to make a file in memory");
+  PetscCall(from_root(comm_, good_));
+  PetscCheck(good_, comm_, PETSC_ERR_LIB, "HDF5 failed to make a file in memory");
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -243,11 +237,9 @@ PetscErrorCode Archive::check(bool good, const std::string &name) const
 
 PetscErrorCode Archive::check_root(bool good, const std::string &name) const
 {
-  int all = good;
-
   PetscFunctionBeginUser;
-  PetscCallMPI(MPI_Bcast(&all, 1, MPI_INT, 0, comm_));
-  PetscCall(check(all != 0, name));
+  PetscCall(from_root(comm_, good));
+  PetscCall(check(good, name));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -278,10 +270,7 @@ PetscErrorCode Archive::text(const std::string &name, std::string &text)
     good = read_text(file_, name, text);
   }
   PetscCall(check_root(good, name));
-  std::uint64_t n = text.size();
-  PetscCallMPI(MPI_Bcast(&n, 1, MPI_UINT64_T, 0, comm_));
-  text.resize(n);
-  PetscCallMPI(MPI_Bcast(text.data(), static_cast<PetscMPIInt>(n), MPI_CHAR, 0, comm_));
+  PetscCall(from_root(comm_, text));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

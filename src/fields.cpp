@@ -43,7 +43,7 @@ PetscErrorCode open_part(MPI_Comm comm, const std::string &file, ViewerHandle &v
 PetscErrorCode close_whole(MPI_Comm comm, const std::string &file, ViewerHandle &viewer)
 {
   PetscMPIInt rank;
-  int renamed = 1;
+  bool renamed = true;
 
   PetscFunctionBeginUser;
   viewer.reset();
@@ -53,7 +53,7 @@ PetscErrorCode close_whole(MPI_Comm comm, const std::string &file, ViewerHandle 
     std::filesystem::rename(file + ".part", file, error);
     renamed = !error;
   }
-  PetscCallMPI(MPI_Bcast(&renamed, 1, MPI_INT, 0, comm));
+  PetscCall(from_root(comm, renamed));
   PulmoUserCheck(renamed, comm, "cannot write %s; free the disk or choose another -output_dir", file.c_str());
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -302,14 +302,14 @@ PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
 PetscErrorCode FieldWriter::write_index() const
 {
   const MPI_Comm comm = PetscObjectComm((PetscObject)model_.dm());
+  const std::string file = output_.path("fields.xdmf");
   PetscMPIInt rank;
-  int written = 1;
+  std::ofstream f;
 
   PetscFunctionBeginUser;
   PetscCallMPI(MPI_Comm_rank(comm, &rank));
   if (rank == 0) {
-    const std::string file = output_.path("fields.xdmf"), part = file + ".part";
-    std::ofstream f(part);
+    f.open(file + ".part");
     const auto item = [&](const char *h5, const char *dataset, PetscInt rows, PetscInt columns, const char *type) {
       f << "<DataItem Format=\"HDF\" NumberType=\"" << type << "\" Precision=\""
         << (type[0] == 'I' ? sizeof(PetscInt) : 8) << "\" Dimensions=\"" << rows;
@@ -343,14 +343,8 @@ PetscErrorCode FieldWriter::write_index() const
       f << " </Grid>\n";
     }
     f << "</Grid>\n</Domain>\n</Xdmf>\n";
-    f.close();
-    std::error_code error;
-    if (f.good()) std::filesystem::rename(part, file, error);
-    written = f.good() && !error;
   }
-  PetscCallMPI(MPI_Bcast(&written, 1, MPI_INT, 0, comm));
-  PulmoUserCheck(written, comm, "cannot write %s; free the disk or choose another -output_dir",
-                 output_.path("fields.xdmf").c_str());
+  PetscCall(finish_file(comm, f, file));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -88,10 +88,7 @@ PetscErrorCode check_file(MPI_Comm comm, const std::string &file)
   PetscFunctionBeginUser;
   PetscCallMPI(MPI_Comm_rank(comm, &rank));
   if (rank == 0) PetscCall(find_fault(file, fault));
-  auto length = static_cast<int>(fault.size());
-  PetscCallMPI(MPI_Bcast(&length, 1, MPI_INT, 0, comm));
-  fault.resize(static_cast<std::size_t>(length));
-  PetscCallMPI(MPI_Bcast(fault.data(), length, MPI_CHAR, 0, comm));
+  PetscCall(from_root(comm, fault));
   PulmoUserCheck(fault.empty(), comm, "-dm_plex_filename %s %s", file.c_str(), fault.c_str());
   PetscFunctionReturn(PETSC_SUCCESS);
 }

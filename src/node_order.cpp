@@ -122,8 +122,7 @@ PetscErrorCode NodeOrder::setup(DM dm)
   std::vector<std::uint64_t> around;
   std::vector<Key> mine, all;
   MPI_Datatype key_type;
-  char text[128] = "";
-  int distinct = 1;
+  bool distinct = true;
 
   PetscFunctionBeginUser;
   dm_ = dm;
@@ -158,16 +157,17 @@ PetscErrorCode NodeOrder::setup(DM dm)
       place_[order[i]] = i;
       n_vertices_ += key.depth == 0;
       whole = scramble(whole ^ hash(key.x) ^ key.cells);
-      if (i > 0 && key.tie() == all[order[i - 1]].tie()) distinct = 0;
+      if (i > 0 && key.tie() == all[order[i - 1]].tie()) distinct = false;
     }
+    char text[128];
     std::snprintf(text, sizeof(text), "%zu vertices, %zu edges, hash %016llx", n_vertices_, all.size() - n_vertices_,
                   static_cast<unsigned long long>(whole));
+    identity_ = text;
   }
-  PetscCallMPI(MPI_Bcast(&distinct, 1, MPI_INT, 0, comm));
+  PetscCall(from_root(comm, distinct));
   PulmoUserCheck(distinct, comm,
                  "the mesh has the same cell twice: no checkpoint can tell its nodes apart; remove one");
-  PetscCallMPI(MPI_Bcast(text, sizeof(text), MPI_CHAR, 0, comm));
-  identity_ = text;
+  PetscCall(from_root(comm, identity_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -247,15 +247,13 @@ PetscErrorCode NodeOrder::scatter(PetscInt field, const std::vector<double> &val
   std::vector<PetscMPIInt> counts, offsets;
   std::vector<double> mine, all(values.size());
   PetscMPIInt rank;
-  int whole;
 
   PetscFunctionBeginUser;
   PetscCallMPI(MPI_Comm_rank(comm, &rank));
   PetscCall(count(field, components, counts, offsets));
-  whole =
+  fits =
       rank != 0 || values.size() == static_cast<std::size_t>(offsets.back()) + static_cast<std::size_t>(counts.back());
-  PetscCallMPI(MPI_Bcast(&whole, 1, MPI_INT, 0, comm));
-  fits = whole != 0;
+  PetscCall(from_root(comm, fits));
   if (!fits) PetscFunctionReturn(PETSC_SUCCESS);
   each_node(components, all.size(), [&](std::size_t gathered, std::size_t ordered) {
     std::copy_n(&values[ordered], components, &all[gathered]);

@@ -13,18 +13,25 @@ namespace {
 
 namespace fs = std::filesystem;
 
-/// A rank-0 condition known on all ranks.
-PetscErrorCode on_all_ranks(MPI_Comm comm, bool &value)
+} // namespace
+
+PetscErrorCode finish_file(MPI_Comm comm, std::ofstream &f, const std::string &file)
 {
-  int v = value;
+  PetscMPIInt rank;
+  bool written = true;
 
   PetscFunctionBeginUser;
-  PetscCallMPI(MPI_Bcast(&v, 1, MPI_INT, 0, comm));
-  value = v != 0;
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  if (rank == 0) {
+    std::error_code error;
+    f.close();
+    if (f.good()) fs::rename(file + ".part", file, error);
+    written = f.good() && !error;
+  }
+  PetscCall(from_root(comm, written));
+  PulmoUserCheck(written, comm, "cannot write %s; free the disk or choose another -output_dir", file.c_str());
   PetscFunctionReturn(PETSC_SUCCESS);
 }
-
-} // namespace
 
 PetscErrorCode Output::declare(Options &options)
 {
@@ -65,9 +72,9 @@ PetscErrorCode Output::prepare(const Options &options, const std::string &restar
       fs::remove(probe, error);
     }
   }
-  PetscCall(on_all_ranks(comm, free));
-  PetscCall(on_all_ranks(comm, unfinished));
-  PetscCall(on_all_ranks(comm, writable));
+  PetscCall(from_root(comm, free));
+  PetscCall(from_root(comm, unfinished));
+  PetscCall(from_root(comm, writable));
   PulmoUserCheck(free, comm, "-output_dir %s holds a finished run; give another directory or -output_overwrite",
                  directory_.c_str());
   PulmoUserCheck(!unfinished, comm,
@@ -143,7 +150,7 @@ PetscErrorCode SignalWriter::observe(const StepReport &step)
     }
     written = file_ && std::fflush(file_) == 0 && !std::ferror(file_);
   }
-  PetscCall(on_all_ranks(comm_, written));
+  PetscCall(from_root(comm_, written));
   PulmoUserCheck(written, comm_, "cannot write %s; free the disk or choose another -output_dir",
                  output_.path("signals.csv.part").c_str());
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -163,7 +170,7 @@ PetscErrorCode SignalWriter::finish()
     fs::rename(output_.path("signals.csv.part"), output_.path("signals.csv"), error);
     written = written && !error;
   }
-  PetscCall(on_all_ranks(comm_, written));
+  PetscCall(from_root(comm_, written));
   PulmoUserCheck(written, comm_, "cannot write %s; free the disk or choose another -output_dir",
                  output_.path("signals.csv").c_str());
   PetscFunctionReturn(PETSC_SUCCESS);

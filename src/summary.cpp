@@ -4,7 +4,6 @@
 #include <nlohmann/json.hpp>
 
 #include <cmath>
-#include <filesystem>
 #include <fstream>
 
 namespace pulmo {
@@ -131,25 +130,6 @@ Json regions_json(const RegionAudit &audit, const BreathRows &breath, bool gas)
                                      {"alveolar_pressure_sd_cmH2O", pressure_json(s.sd_pressure)}};
   }
   return json;
-}
-
-/// Gives a file that was written under a temporary name its own; an error on all ranks if that or the writing failed.
-PetscErrorCode finish_file(MPI_Comm comm, std::ofstream &f, const std::string &file)
-{
-  PetscMPIInt rank;
-  int written = 1;
-
-  PetscFunctionBeginUser;
-  PetscCallMPI(MPI_Comm_rank(comm, &rank));
-  if (rank == 0) {
-    std::error_code error;
-    f.close();
-    if (f.good()) std::filesystem::rename(file + ".part", file, error);
-    written = f.good() && !error;
-  }
-  PetscCallMPI(MPI_Bcast(&written, 1, MPI_INT, 0, comm));
-  PulmoUserCheck(written, comm, "cannot write %s; free the disk or choose another -output_dir", file.c_str());
-  PetscFunctionReturn(PETSC_SUCCESS);
 }
 
 } // namespace

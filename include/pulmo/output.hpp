@@ -6,9 +6,14 @@
 #include "pulmo/regions.hpp"
 
 #include <cstdio>
+#include <fstream>
 #include <memory>
 
 namespace pulmo {
+
+/// Gives @p file, which rank 0 wrote through @p f under its name and ".part", its own name; a user error on all ranks
+/// if that or the writing failed.
+PetscErrorCode finish_file(MPI_Comm comm, std::ofstream &f, const std::string &file);
 
 /// The run's directory and the options `-output_*`, `-progress`.
 class Output {

@@ -7,6 +7,7 @@
 #include <petscsf.h>
 #include <petscts.h>
 
+#include <cstdint>
 #include <string>
 #include <utility>
 
@@ -121,6 +122,27 @@ using SFHandle = Handle<PetscSF, PetscSFDestroy>;
 using TSHandle = Handle<TS, TSDestroy>;
 using VecHandle = Handle<Vec, VecDestroy>;
 using ViewerHandle = Handle<PetscViewer, PetscViewerDestroy>;
+
+/// Makes what rank 0 knows known to all ranks.
+inline PetscErrorCode from_root(MPI_Comm comm, bool &value)
+{
+  int v = value;
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Bcast(&v, 1, MPI_INT, 0, comm));
+  value = v != 0;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+inline PetscErrorCode from_root(MPI_Comm comm, std::string &text)
+{
+  std::uint64_t n = text.size();
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Bcast(&n, 1, MPI_UINT64_T, 0, comm));
+  text.resize(n);
+  PetscCallMPI(MPI_Bcast(text.data(), static_cast<PetscMPIInt>(n), MPI_CHAR, 0, comm));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
 
 /// Read access to the entries of a Vec for the life of this object.
 class ReadArray {
