@@ -1,8 +1,8 @@
 #include "pulmo/command_line.hpp"
 
+#include "pulmo/petsc.hpp"
+
 #include <algorithm>
-#include <cctype>
-#include <cstdlib>
 #include <filesystem>
 #include <fstream>
 
@@ -10,16 +10,12 @@ namespace pulmo {
 
 namespace {
 
-/// Whether PETSc takes a word for the name of an option: one or two dashes and a letter, but not -inf or -nan.
+/// Whether PETSc takes a word for the name of an option.
 bool is_option(const std::string &word)
 {
-  const std::size_t letter = word.compare(0, 2, "--") == 0 ? 2 : 1;
-  if (word.empty() || word[0] != '-' || word.size() <= letter ||
-      !std::isalpha(static_cast<unsigned char>(word[letter])))
-    return false;
-  char *rest = nullptr;
-  (void)std::strtod(word.c_str(), &rest);
-  return rest == word.c_str() || *rest == '_' || std::isalnum(static_cast<unsigned char>(*rest));
+  PetscBool valid = PETSC_FALSE;
+  (void)PetscOptionsValidKey(word.c_str(), &valid); // needs no PetscInitialize
+  return valid;
 }
 
 /// A file that PETSc reads as YAML.

@@ -303,10 +303,10 @@ PetscErrorCode Options::all_given(std::vector<std::pair<std::string, std::string
   PetscCall(PetscOptionsGetAll(nullptr, &all));
   std::istringstream stream(all);
   PetscCall(PetscFree(all));
-  // the database prints "-name value -name value ..."; a value never begins with '-' and a letter or another '-'
+  // the database prints "-name value -name value ..."
   for (std::string word; stream >> word;) {
-    const bool is_name =
-        word.size() > 1 && word[0] == '-' && (word[1] == '-' || std::isalpha(static_cast<unsigned char>(word[1])));
+    PetscBool is_name;
+    PetscCall(PetscOptionsValidKey(word.c_str(), &is_name));
     if (is_name)
       list.emplace_back(word, "");
     else if (!list.empty())
