@@ -56,12 +56,10 @@ PetscReal Airway::prescribed_pressure(PetscReal t, PetscReal step_end) const
   return phase_.value(t);
 }
 
-void Airway::begin_stage(PetscReal t, PetscReal step_end, const TimeScheme &scheme)
+void Airway::begin_stage(PetscReal t, PetscReal step_end)
 {
-  slope_ = scheme.slope();
-  past_flow_ = scheme.past_flow();
   limited_ = limited_before_ || retake_;
-  retake_ = retake_ && scheme.half_step(); // the whole step that follows belongs to the same attempt
+  retake_ = retake_ && scheme_.half_step(); // the whole step that follows belongs to the same attempt
   set_mode();
   if (control() == Control::flow)
     volume_target_ = volume_begin_ + phase_.delivered(t);
@@ -82,7 +80,7 @@ PetscErrorCode Airway::apply(Vec X)
   PetscFunctionBeginUser;
   if (mode_ == Mode::common) PetscCall(model_.carrier_value(X, pressure_));
   model_.hold_airway(mode_ != Mode::free);
-  PetscCall(model_.set_step(1 / slope_, pressure_, mode_ == Mode::free ? flow() : 0));
+  PetscCall(model_.set_step(1 / scheme_.slope(), pressure_, mode_ == Mode::free ? flow() : 0));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -92,7 +90,7 @@ PetscErrorCode Airway::close(PetscReal volume, Vec F)
   volume_ = volume;
   PetscCall(model_.close_rows(F));
   if (mode_ == Mode::common) {
-    const PetscReal h = model_.composition().mesh().length(), Q = rate(volume);
+    const PetscReal h = model_.composition().mesh().length(), Q = scheme_.flow(volume);
     const PetscReal c = control() == Control::flow ? (volume - volume_target_) / (h * h * h)
                                                    : (ventilator_pressure(Q) - target_) / model_.modulus();
     PetscCall(model_.set_carrier_value(F, c));
@@ -103,8 +101,9 @@ PetscErrorCode Airway::close(PetscReal volume, Vec F)
 PetscReal Airway::change(PetscReal c, PetscReal c_P, PetscReal volume_fixed, PetscReal volume_per_P) const
 {
   const PetscReal h = model_.composition().mesh().length();
-  const PetscReal c_V =
-      control() == Control::flow ? 1 / (h * h * h) : facts_.tube->slope(rate(volume_)) * slope_ / model_.modulus();
+  const PetscReal c_V = control() == Control::flow
+                            ? 1 / (h * h * h)
+                            : facts_.tube->slope(scheme_.flow(volume_)) * scheme_.slope() / model_.modulus();
   return -(c + c_V * volume_fixed) / (c_P + c_V * volume_per_P);
 }
 

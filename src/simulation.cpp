@@ -135,20 +135,20 @@ PetscReal Simulation::landing(PetscReal t) const
   return dt_;
 }
 
-PetscReal Simulation::next_step(PetscReal t, PetscReal h, _p_TSAdapt &adapt, PetscBool &accept)
+PetscReal Simulation::next_step(PetscReal t, PetscReal h, TSAdapt adapt, PetscBool &accept)
 {
   accept = PETSC_TRUE;
   if (!step_control_.in_use()) {
     if (cut_)
       dt_ = h; // it took cuts to get here
     else if (h >= dt_ * (1 - same_time))
-      dt_ = std::min(wanted_dt_, adapt.clip[1] * dt_); // a full step: grow back
+      dt_ = std::min(wanted_dt_, adapt->clip[1] * dt_); // a full step: grow back
     return landing(t + h);
   }
   const int order = scheme_.order();
   const auto error = step_control_.error(order, candidate_, airway_.free_values());
   const PetscReal growth = error ? StepControl::growth(order, *error) : 1,
-                  least = std::max(adapt.dt_min, least_step * wanted_dt_);
+                  least = std::max(adapt->dt_min, least_step * wanted_dt_);
   if (error && *error > 1 && growth * h > least) {
     accept = PETSC_FALSE;
     ++rejected_;
@@ -156,7 +156,7 @@ PetscReal Simulation::next_step(PetscReal t, PetscReal h, _p_TSAdapt &adapt, Pet
     return landing(t);
   }
   // a step that was shortened to land says little of longer ones
-  dt_ = std::min(adapt.dt_max, cut_ ? h : std::max(growth * h, h < dt_ && growth > 1 ? dt_ : 0));
+  dt_ = std::min(adapt->dt_max, cut_ ? h : std::max(growth * h, h < dt_ && growth > 1 ? dt_ : 0));
   return landing(t + h);
 }
 
@@ -234,7 +234,7 @@ PetscErrorCode Simulation::before_stage(PetscReal t)
   PetscCall(TSGetTime(ts_, &begin));
   PetscCall(TSGetTimeStep(ts_, &dt));
   PetscCall(scheme_.begin_stage(t, dt));
-  airway_.begin_stage(t, begin + dt, scheme_);
+  airway_.begin_stage(t, begin + dt);
   model_.set_load(std::min<PetscReal>(1, (begin + dt) / std::min(wanted_dt_, end_)));
   extra_newton_ = 0;
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -250,6 +250,15 @@ PetscErrorCode Simulation::make_rate()
     PetscCall(VecWAXPY(rate_, -1, before_, local_));
     PetscCall(VecScale(rate_, scheme_.slope()));
   }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Fills local_residual_ from local_ and rate_ at time t.
+PetscErrorCode Simulation::local_residual(PetscReal t)
+{
+  PetscFunctionBeginUser;
+  PetscCall(model_.residual(t, local_, rate_, local_residual_));
+  PetscCall(scheme_.add_past(model_, local_residual_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -287,8 +296,7 @@ PetscErrorCode Simulation::residual(PetscReal t, Vec X, Vec Xdot, Vec F)
     PetscCall(SNESSetFunctionDomainError(snes));
     PetscFunctionReturn(PETSC_SUCCESS);
   }
-  PetscCall(model_.residual(t, local_, rate_, local_residual_));
-  PetscCall(scheme_.add_past(model_, local_residual_));
+  PetscCall(local_residual(t));
   PetscCall(VecZeroEntries(F));
   PetscCall(DMLocalToGlobal(model_.dm(), local_residual_, ADD_VALUES, F));
   PetscCall(airway_.close(measures.volume_change, F));
@@ -433,8 +441,7 @@ PetscErrorCode Simulation::keep_step(PetscReal dt)
 
   PetscFunctionBeginUser;
   PetscCall(TSRestartStep(ts_)); // as in reject()
-  PetscCall(heed_signal());
-  if (stopped_) PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
+  PetscCall(heed_signal(TS_DIVERGED_STEP_REJECTED));
   PetscCall(TSGetAdapt(ts_, &adapt));
   PetscCall(TSSetTimeStep(ts_, dt / adapt->scale_solve_failed));
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -476,8 +483,7 @@ PetscErrorCode Simulation::reject(PetscReal dt, const std::string &reason, Petsc
   const PetscReal next = dt * adapt->scale_solve_failed;
   if (next < std::max(adapt->dt_min, least_step * wanted_dt_))
     PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
-  PetscCall(heed_signal());
-  if (stopped_) PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
+  PetscCall(heed_signal(TS_DIVERGED_STEP_REJECTED));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -513,10 +519,7 @@ PetscErrorCode Simulation::after_step()
   row.volume = measures.volume_change / units::mm3_per_ml;
   const bool free = airway_.mode() == Airway::Mode::free, airflow = scene_.facts().airflow,
              supported = model_.composition().supported();
-  if ((airflow && !free) || supported) {
-    PetscCall(model_.residual(t, local_, rate_, local_residual_));
-    PetscCall(scheme_.add_past(model_, local_residual_));
-  }
+  if ((airflow && !free) || supported) PetscCall(local_residual(t));
   if (supported) {
     std::vector<std::array<PetscReal, 3>> forces;
     PetscCall(model_.reactions(local_residual_, forces));
@@ -559,15 +562,15 @@ PetscErrorCode Simulation::after_step()
   }
   PetscCall(report(row, measures));
   if (crawled_ == crawling_steps) PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
-  if (!same(t, end_)) PetscCall(heed_signal());
-  if (stopped_) PetscCall(TSSetConvergedReason(ts_, TS_CONVERGED_USER));
+  if (!same(t, end_)) PetscCall(heed_signal(TS_CONVERGED_USER));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Simulation::heed_signal()
+PetscErrorCode Simulation::heed_signal(TSConvergedReason reason)
 {
   PetscFunctionBeginUser;
   if (stop_signal_) PetscCall(stop_signal_->asked(stopped_));
+  if (stopped_) PetscCall(TSSetConvergedReason(ts_, reason));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

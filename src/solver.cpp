@@ -100,7 +100,7 @@ PetscErrorCode choose_step(TSAdapt adapt, TS ts, PetscReal h, PetscInt *next_sch
   PetscFunctionBeginUser;
   PetscCall(simulation_of(ts, &simulation));
   *next_scheme = 0;
-  *next_h = simulation->next_step(ts->ptime, h, *adapt, *accept);
+  *next_h = simulation->next_step(ts->ptime, h, adapt, *accept);
   *wlte = *wltea = *wlter = -1; // PETSc is told no error
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -128,7 +128,6 @@ PetscErrorCode Simulation::create_solver()
   KSP ksp;
   PC pc;
   TSAdapt adapt;
-  PetscReal max_time;
   PetscInt max_steps;
   PetscBool own_control, has_pc, is_fieldsplit = PETSC_FALSE, is_lu = PETSC_FALSE;
   char pc_type[64] = "";
@@ -201,13 +200,10 @@ PetscErrorCode Simulation::create_solver()
     PetscCall(VecDuplicate(local_, border_y_.out()));
   }
   PetscCall(TSGetTimeStep(ts_, &wanted_dt_));
-  PulmoUserCheck(wanted_dt_ > 0, comm, "-ts_dt %g s must be positive", (double)wanted_dt_);
-  PetscCall(TSGetMaxTime(ts_, &max_time));
   PetscCall(TSGetMaxSteps(ts_, &max_steps));
   PulmoUserCheck(max_steps == PETSC_MAX_INT, comm, "-ts_max_steps would cut a phase short; use -ts_max_time");
   PetscCall(PetscObjectTypeCompare((PetscObject)adapt, "pulmo", &own_control));
   PulmoUserCheck(own_control, comm, "-ts_adapt_type: pulmo cuts, regrows and lands steps itself; leave the option out");
-  PulmoUserCheck(max_time > 0, comm, "-ts_max_time %g s leaves nothing to run; it must be positive", (double)max_time);
   PetscCall(scheme_.setup(ts_, local_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }

@@ -22,7 +22,10 @@ class Airway {
 public:
   enum class Mode { held, free, common };
 
-  Airway(Model &model, const SceneFacts &facts) : model_(model), facts_(facts) {}
+  /// @p scheme: where rates of volume come from.
+  Airway(Model &model, const SceneFacts &facts, const TimeScheme &scheme)
+      : model_(model), facts_(facts), scheme_(scheme)
+  {}
 
   /// Begins a phase at lung volume @p volume (mm^3 above rest) whose first step is to take @p first_step s. A ramp of
   /// pressure without a start value starts from what the ventilator has then.
@@ -34,9 +37,8 @@ public:
   {
     return model_.composition().common_gas_pressure() ? model_.set_carrier_value(X, pressure_before_) : PETSC_SUCCESS;
   }
-  /// Begins an attempt at a stage that ends at @p t, of a step that ends at @p step_end, s. @p scheme: where rates of
-  /// volume come from.
-  void begin_stage(PetscReal t, PetscReal step_end, const TimeScheme &scheme);
+  /// Begins an attempt at a stage that ends at @p t, of a step that ends at @p step_end, s; the scheme has begun it.
+  void begin_stage(PetscReal t, PetscReal step_end);
   /// The attempt at hand failed and is made once more, as it was.
   void again() { retake_ = limited_; }
   /// The attempt at hand failed and a shorter one is made: that may stay below the limit.
@@ -78,7 +80,7 @@ public:
   /// What of volume and pressure the step at hand leaves free.
   StepControl::Free free_values() const { return {control() != Control::flow, mode_ != Mode::held}; }
   /// Flow prescribed in the step at hand, mm^3/s.
-  PetscReal flow() const { return rate(volume_target_); }
+  PetscReal flow() const { return scheme_.flow(volume_target_); }
 
 private:
   /// What the phase prescribes: after its limit was reached a pressure.
@@ -86,11 +88,10 @@ private:
   void set_mode();
   /// The pressure that the phase prescribes, kPa.
   PetscReal prescribed_pressure(PetscReal t, PetscReal step_end) const;
-  /// Rate of volume at the end of the stage if that ends at @p volume, mm^3/s.
-  PetscReal rate(PetscReal volume) const { return slope_ * volume + past_flow_; }
 
   Model &model_;
   const SceneFacts &facts_;
+  const TimeScheme &scheme_;
   Phase phase_;
   Mode mode_ = Mode::held;
   bool limited_ = false, limited_before_ = false; ///< the limit is held now, was held in the step before
@@ -100,7 +101,6 @@ private:
   PetscReal target_ = 0;                          ///< pressure that the phase prescribes, kPa
   PetscReal volume_begin_ = 0;                    ///< at the begin of the phase, mm^3
   PetscReal volume_target_ = 0, volume_ = 0;      ///< prescribed; at the last close(), mm^3
-  PetscReal slope_ = 1, past_flow_ = 0;           ///< of rate(): 1/s, mm^3/s
   PetscReal first_step_ = 0;                      ///< of the phase, s
 };
 

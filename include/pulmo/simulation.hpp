@@ -12,8 +12,6 @@
 #include "pulmo/step_control.hpp"
 #include "pulmo/stop_signal.hpp"
 
-struct _p_TSAdapt;
-
 namespace pulmo {
 
 /// What an observer sees after each accepted step (and once at the start).
@@ -53,7 +51,7 @@ struct StageSeconds {
 class Simulation {
 public:
   Simulation(const Options &options, const Scene &scene, Model &model)
-      : options_(options), scene_(scene), model_(model), airway_(model, scene.facts())
+      : options_(options), scene_(scene), model_(model), airway_(model, scene.facts(), scheme_)
   {}
 
   /// Declares the options of the steps.
@@ -101,7 +99,7 @@ public:
   PetscErrorCode after_step();
   /// Whether the step of size @p h from @p t is accepted, and the size of the one after it (or of the next attempt):
   /// grows back after cuts, or follows the error in time.
-  PetscReal next_step(PetscReal t, PetscReal h, _p_TSAdapt &adapt, PetscBool &accept);
+  PetscReal next_step(PetscReal t, PetscReal h, TSAdapt adapt, PetscBool &accept);
 
 private:
   PetscErrorCode create_solver();
@@ -110,8 +108,8 @@ private:
   PetscErrorCode persist_rows(Archive &archive);
   /// Finds the phase that goes on at what was read.
   PetscErrorCode resume(const Archive &archive, PetscInt index, PetscReal wanted_dt, PetscReal phase_end);
-  /// Whether a signal asks to stop.
-  PetscErrorCode heed_signal();
+  /// Ends the run with @p reason if a signal asks to stop.
+  PetscErrorCode heed_signal(TSConvergedReason reason);
   PetscErrorCode offer_fixed_stress(KSP ksp);
   /// Whether two times of this run are the same up to rounding.
   bool same(PetscReal t, PetscReal other) const;
@@ -120,6 +118,7 @@ private:
   /// Step size from time @p t, shortened to land on the end of the ramp or of the phase.
   PetscReal landing(PetscReal t) const;
   PetscErrorCode make_rate();
+  PetscErrorCode local_residual(PetscReal t);
   PetscErrorCode scatter(PetscReal t, Vec X, Vec Xdot);
   PetscErrorCode keep_step(PetscReal dt);
   PetscErrorCode fail(PetscReal dt, const std::string &reason, PetscInt newton, const Measures &measures, bool inverted,
@@ -133,8 +132,8 @@ private:
   const Options &options_;
   const Scene &scene_;
   Model &model_;
-  Airway airway_;
   TimeScheme scheme_;
+  Airway airway_;
   StepControl step_control_;
   StepControl::Value candidate_; ///< at the end of the step that is to be accepted
   Predictor predictor_;

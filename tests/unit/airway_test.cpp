@@ -12,7 +12,7 @@ using Mode = Airway::Mode;
 /// An airway with the rates of backward Euler, steps of 0.05 s asked for.
 class EulerAirway : public Airway {
 public:
-  explicit EulerAirway(SceneRun &run) : Airway(run.model(), run.scene().facts()), model_(run.model()) {}
+  explicit EulerAirway(SceneRun &run) : Airway(run.model(), run.scene().facts(), scheme_), model_(run.model()) {}
   void begin_phase(const Phase &phase, PetscReal volume)
   {
     Airway::begin_phase(phase, volume, 0.05);
@@ -21,7 +21,7 @@ public:
   void begin_step(PetscReal t, PetscReal dt)
   {
     PULMO_OK(scheme_.begin_stage(t, dt));
-    begin_stage(t, t, scheme_);
+    begin_stage(t, t);
     t_ = t;
   }
   void accept(PetscReal volume, PetscReal flow)
