@@ -60,6 +60,33 @@ void add_pauses(const std::vector<SignalRow> &rows, std::size_t first, std::size
 
 } // namespace
 
+std::vector<ClinicalEntry> clinical_entries(const ClinicalNumbers &n, const std::optional<double> &frc)
+{
+  const auto strain = frc ? std::optional<double>(n.tidal_volume / *frc) : std::nullopt;
+  return {
+      {"peak_inspiratory_pressure_cmH2O", "peak inspiratory pressure", "cmH2O", n.peak_pressure},
+      {"plateau_pressure_cmH2O", "plateau pressure", "cmH2O", n.plateau_pressure},
+      {"peep_cmH2O", "PEEP", "cmH2O", n.peep},
+      {"auto_peep_cmH2O", "auto-PEEP", "cmH2O", n.auto_peep},
+      {"total_peep_cmH2O", "total PEEP", "cmH2O", n.total_peep},
+      {"driving_pressure_cmH2O", "driving pressure", "cmH2O", n.driving_pressure},
+      {"tidal_volume_ml", "tidal volume", "ml", n.tidal_volume},
+      {"trapped_volume_ml", "trapped volume", "ml", n.trapped_volume},
+      {"peak_flow_ml_per_s", "peak inspiratory flow", "ml/s", n.peak_flow},
+      {"peak_expiratory_flow_ml_per_s", "peak expiratory flow", "ml/s", n.peak_expiratory_flow},
+      {"compliance_ml_per_cmH2O", "compliance C_rs (fit)", "ml/cmH2O", n.compliance},
+      {"resistance_cmH2O_s_per_l", "resistance R (fit)", "cmH2O s/l", n.resistance},
+      {"time_constant_s", "time constant R C_rs", "s", n.time_constant},
+      {"static_compliance_ml_per_cmH2O", "static compliance", "ml/cmH2O", n.static_compliance},
+      {"dynamic_compliance_ml_per_cmH2O", "dynamic compliance", "ml/cmH2O", n.dynamic_compliance},
+      {"static_curve_compliance_ml_per_cmH2O", "slope of the static curve", "ml/cmH2O", n.static_curve_compliance},
+      {"pause_resistance_cmH2O_s_per_l", "resistance from the pause", "cmH2O s/l", n.pause_resistance},
+      {"work_j", "work of (P - PEEP)", "J", n.work},
+      {"mechanical_power_j_per_min", "mechanical power", "J/min", n.mechanical_power},
+      {"strain", "strain V_T/FRC", "", strain},
+  };
+}
+
 std::vector<BreathRows> breath_rows(const std::vector<SignalRow> &rows)
 {
   std::vector<BreathRows> list;
@@ -71,6 +98,12 @@ std::vector<BreathRows> breath_rows(const std::vector<SignalRow> &rows)
     if (rows[i].volume > rows[b.fullest].volume) b.fullest = i;
   }
   return list;
+}
+
+BreathRows last_breath(const std::vector<SignalRow> &rows)
+{
+  const auto breaths = breath_rows(rows);
+  return breaths.empty() ? BreathRows{0, rows.size() - 1, rows.size() - 1} : breaths.back();
 }
 
 std::vector<StaticPoint> static_points(const std::vector<SignalRow> &rows, std::size_t first, std::size_t last)

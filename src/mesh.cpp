@@ -79,20 +79,6 @@ PetscErrorCode find_fault(const std::string &file, std::string &fault)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-/// Looks at the file on rank 0 alone so that an unreadable mesh is one clear error on all ranks.
-PetscErrorCode check_file(MPI_Comm comm, const std::string &file)
-{
-  PetscMPIInt rank;
-  std::string fault;
-
-  PetscFunctionBeginUser;
-  PetscCallMPI(MPI_Comm_rank(comm, &rank));
-  if (rank == 0) PetscCall(find_fault(file, fault));
-  PetscCall(from_root(comm, fault));
-  PulmoUserCheck(fault.empty(), comm, "-dm_plex_filename %s %s", file.c_str(), fault.c_str());
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
 /// Corner coordinates (4 x 3, mm) of a local tetrahedron.
 PetscErrorCode cell_corners(DM dm, PetscInt cell, PetscScalar x[12])
 {
@@ -132,6 +118,19 @@ PetscErrorCode find_shared_points(DM dm, PetscInt point_end, std::vector<char> &
 
 } // namespace
 
+PetscErrorCode check_mesh_file(MPI_Comm comm, const char *option, const std::string &file)
+{
+  PetscMPIInt rank;
+  std::string fault;
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  if (rank == 0) PetscCall(find_fault(file, fault));
+  PetscCall(from_root(comm, fault));
+  PulmoUserCheck(fault.empty(), comm, "%s %s %s", option, file.c_str(), fault.c_str());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode Mesh::declare(Options &options)
 {
   PetscFunctionBeginUser;
@@ -154,7 +153,7 @@ PetscErrorCode Mesh::read(const Options &options, bool ventilated)
   PetscCall(PetscOptionsGetString(nullptr, nullptr, "-dm_plex_filename", name, sizeof(name), &given));
   PulmoUserCheck(given, comm, "no mesh: give -dm_plex_filename FILE.msh (pulmo's own are in meshes/)");
   file_ = name;
-  PetscCall(check_file(comm, file_));
+  PetscCall(check_mesh_file(comm, "-dm_plex_filename", file_));
 
   // one label per physical name
   PetscCall(PetscOptionsSetValue(nullptr, "-dm_plex_gmsh_use_regions", "true"));

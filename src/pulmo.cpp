@@ -159,6 +159,7 @@ PetscErrorCode run(const Registry &registry, bool &finished)
   const Scene &scene = run.scene();
   Simulation &simulation = run.simulation();
   Output output;
+  ErrorEstimate error_estimate(registry);
   Checkpoint checkpoint(options, output, scene, run.model(), simulation);
   bool view_effects = false, audit_energy = true;
   PetscBool help, has_mesh;
@@ -168,6 +169,7 @@ PetscErrorCode run(const Registry &registry, bool &finished)
   PetscCall(run.declare());
   PetscCall(output.declare(options));
   PetscCall(checkpoint.declare(options));
+  PetscCall(error_estimate.declare(options));
   options.group("effects", "ledger");
   PetscCall(options.flag("view", "print effects, fields, terms, blocks and seconds at the end", view_effects));
   options.group("energy", "energy balance");
@@ -185,6 +187,7 @@ PetscErrorCode run(const Registry &registry, bool &finished)
       run.model().composition().held(), comm,
       "nothing holds the lung in place: give -chest_wall (springs), or -support -support_rigid to let it move "
       "freely but for the six rigid-body motions");
+  PetscCall(error_estimate.check(options, scene));
 
   SignalWriter signals(comm, output, scene.facts());
   ProgressPrinter progress(comm, scene.facts());
@@ -199,7 +202,7 @@ PetscErrorCode run(const Registry &registry, bool &finished)
                    "-energy_audit: the balance is that of backward Euler; leave the option out with -ts_type bdf");
     audit_energy = false;
   }
-  const Audits audits{regions, audit_energy ? &energy : nullptr};
+  Audits audits{regions, audit_energy ? &energy : nullptr};
   PetscCall(sampling.setup(run.model()));
   PetscCall(regions.setup());
   simulation.add(regions);
@@ -236,6 +239,15 @@ PetscErrorCode run(const Registry &registry, bool &finished)
   PetscCall(signals.finish());
   PetscCall(write_summary(options, output, scene, run.model(), simulation, audits, true));
   PetscCall(print_numbers(comm, output, scene, simulation, audits));
+  if (error_estimate.in_use()) {
+    ErrorReport report;
+    const auto numbers =
+        clinical_entries(overall_numbers(regions.complete(simulation.rows())), scene.functional_residual_capacity());
+    PetscCall(error_estimate.make(options, output, scene, simulation, numbers, report));
+    audits.errors = &report;
+    PetscCall(write_summary(options, output, scene, run.model(), simulation, audits, true));
+    PetscCall(print_error_bars(comm, report));
+  }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -97,4 +97,15 @@ std::vector<SignalRow> RegionAudit::complete(std::vector<SignalRow> rows) const
   return rows;
 }
 
+double RegionAudit::ventilation(const BreathRows &breath, std::size_t region) const
+{
+  return state(breath.fullest, region).volume_change - state(breath.first, region).volume_change;
+}
+
+std::optional<double> RegionAudit::ventilation_share(const BreathRows &breath, std::size_t region) const
+{
+  const double whole = ventilation(breath, regions_.size());
+  return whole != 0 ? std::optional<double>(ventilation(breath, region) / whole) : std::nullopt;
+}
+
 } // namespace pulmo

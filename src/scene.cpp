@@ -1,5 +1,7 @@
 #include "pulmo/scene.hpp"
 
+#include "pulmo/units.hpp"
+
 namespace pulmo {
 
 Scene::Scene(const Registry &registry)
@@ -45,6 +47,12 @@ PetscErrorCode Scene::compose(Composition &composition) const
     PetscCall(effect->terms(composition, facts_));
   }
   PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+std::optional<double> Scene::functional_residual_capacity() const
+{
+  if (!facts_.airflow) return std::nullopt;
+  return airflow_->porosity() * mesh_.volume() / units::mm3_per_ml;
 }
 
 std::vector<const Effect *> Scene::active() const

@@ -53,6 +53,15 @@ struct ClinicalNumbers {
   double mechanical_power = 0;                   ///< work times rate, J/min
 };
 
+/// A number of a breath as it is listed.
+struct ClinicalEntry {
+  const char *key, *label, *unit; ///< key: in summary.json
+  std::optional<double> value;
+};
+
+/// All numbers of a breath in the order of the table. @p frc: gas volume at rest, ml.
+std::vector<ClinicalEntry> clinical_entries(const ClinicalNumbers &numbers, const std::optional<double> &frc);
+
 /// First and last row of a breath, and the row with its largest volume. The first row is the last one before the
 /// breath.
 struct BreathRows {
@@ -67,6 +76,9 @@ struct StaticPoint {
 
 /// The rows of each breath.
 std::vector<BreathRows> breath_rows(const std::vector<SignalRow> &rows);
+
+/// Those of the last breath, or of the whole run without one.
+BreathRows last_breath(const std::vector<SignalRow> &rows);
 
 /// The end of every pause of rows (first, last].
 std::vector<StaticPoint> static_points(const std::vector<SignalRow> &rows, std::size_t first, std::size_t last);

@@ -81,4 +81,7 @@ private:
 /// Makes `-petscpartitioner_type metis` known to PETSc (METIS k-way on the rank that holds the mesh).
 PetscErrorCode register_metis_partitioner();
 
+/// Looks at a mesh file on rank 0 alone, so that an unreadable one is a clear error on all ranks that names @p option.
+PetscErrorCode check_mesh_file(MPI_Comm comm, const char *option, const std::string &file);
+
 } // namespace pulmo

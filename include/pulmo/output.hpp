@@ -3,6 +3,7 @@
 #pragma once
 
 #include "pulmo/energy.hpp"
+#include "pulmo/error_estimate.hpp"
 #include "pulmo/regions.hpp"
 
 #include <cstdio>
@@ -119,10 +120,11 @@ private:
   Schedule schedule_;
 };
 
-/// What a run was watched by.
+/// What a run was watched by, and what is known of its errors.
 struct Audits {
   const RegionAudit &regions;
-  const EnergyAudit *energy; ///< null with -energy_audit off
+  const EnergyAudit *energy;           ///< null with -energy_audit off
+  const ErrorReport *errors = nullptr; ///< null before the estimate, or without -error_estimate
 };
 
 /// Writes summary.json (a finished run) or failure.json (a run that could not go on).
@@ -136,6 +138,9 @@ PetscErrorCode write_energy(MPI_Comm comm, const Output &output, const Simulatio
 /// Prints the clinical numbers, the energy balance and the regions as tables.
 PetscErrorCode print_numbers(MPI_Comm comm, const Output &output, const Scene &scene, const Simulation &simulation,
                              const Audits &audits);
+
+/// Prints each clinical number with its error bar, and what the bars cost.
+PetscErrorCode print_error_bars(MPI_Comm comm, const ErrorReport &report);
 
 /// Prints the ledger of `-effects_view`: effect, fields, terms, blocks, seconds.
 PetscErrorCode print_ledger(MPI_Comm comm, const Scene &scene, const Model &model, const StageSeconds &seconds);

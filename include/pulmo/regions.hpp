@@ -32,6 +32,10 @@ public:
   double volume(std::size_t region) const { return volumes_[region]; }
   /// State of a region at a row of the signals.
   const RegionState &state(std::size_t row, std::size_t region) const { return rows_[row][region]; }
+  /// What a region took in during a breath, ml.
+  double ventilation(const BreathRows &breath, std::size_t region) const;
+  /// The same as a share of the whole lung's.
+  std::optional<double> ventilation_share(const BreathRows &breath, std::size_t region) const;
   /// The signals with the mean alveolar pressure of the whole lung filled in.
   std::vector<SignalRow> complete(std::vector<SignalRow> rows) const;
 

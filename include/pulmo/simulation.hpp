@@ -80,6 +80,9 @@ public:
   PetscInt rejected_steps() const { return rejected_; }
   const StageSeconds &seconds() const { return seconds_; }
   const TimeScheme &scheme() const { return scheme_; }
+  const StepControl &step_control() const { return step_control_; }
+  PetscReal wanted_dt() const { return wanted_dt_; } ///< -ts_dt, s
+  TS ts() const { return ts_; }
   /// One paragraph on a run that could not go on: where, when, what was tried, what to try.
   std::string failure_text() const;
 

@@ -26,6 +26,8 @@ public:
   /// Declares -step_volume_tolerance and -step_pressure_tolerance.
   PetscErrorCode declare(Options &options);
   bool in_use() const { return volume_tolerance_ > 0 || pressure_tolerance_ > 0; }
+  PetscReal volume_tolerance() const { return volume_tolerance_; }     ///< ml
+  PetscReal pressure_tolerance() const { return pressure_tolerance_; } ///< cmH2O
   PetscErrorCode persist(Archive &archive);
 
   /// Forgets all before @p value: the time derivatives jump there.

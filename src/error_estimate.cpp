@@ -1,0 +1,307 @@
+#include "pulmo/error_estimate.hpp"
+
+#include "pulmo/output.hpp"
+#include "pulmo/pulmo.hpp"
+#include "pulmo/units.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <sstream>
+
+namespace pulmo {
+
+namespace {
+
+/// A mesh whose cells are nearer in size than this tells nothing of the error in space.
+constexpr double least_ratio = 1.2;
+
+/// Volumes at rest of two meshes of one lung differ by less than this share.
+constexpr double same_lung = 0.1;
+
+/// Solver tolerances are tightened by this factor, but not to rounding.
+constexpr PetscReal tighter = 0.01, tightest = 1e-12;
+
+/// Options of what a run leaves behind: a level writes nothing.
+constexpr const char *output_prefixes[] = {"-output",     "-progress", "-effects",       "-energy",
+                                           "-checkpoint", "-restart",  "-error_estimate"};
+
+bool is_output_option(const std::string &name)
+{
+  return std::any_of(std::begin(output_prefixes), std::end(output_prefixes), [&](const std::string &prefix) {
+    return name.compare(0, prefix.size(), prefix) == 0 && (name.size() == prefix.size() || name[prefix.size()] == '_');
+  });
+}
+
+std::string text_of(double v)
+{
+  std::ostringstream s;
+  s.precision(15);
+  s << v;
+  return s.str();
+}
+
+/// Another options database in place of PETSc's default one while it lives.
+class OptionsInForce {
+public:
+  OptionsInForce() = default;
+  ~OptionsInForce()
+  {
+    if (pushed_) (void)PetscOptionsPop();
+    if (options_) (void)PetscOptionsDestroy(&options_);
+  }
+  OptionsInForce(const OptionsInForce &) = delete;
+  OptionsInForce &operator=(const OptionsInForce &) = delete;
+
+  PetscErrorCode put(const std::vector<std::pair<std::string, std::string>> &list)
+  {
+    PetscFunctionBeginUser;
+    PetscCall(PetscOptionsCreate(&options_));
+    for (const auto &[name, value] : list)
+      PetscCall(PetscOptionsSetValue(options_, name.c_str(), value.empty() ? nullptr : value.c_str()));
+    PetscCall(PetscOptionsPush(options_));
+    pushed_ = true;
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+private:
+  PetscOptions options_ = nullptr;
+  bool pushed_ = false;
+};
+
+/// How many times larger the cells of @p other are than those of @p level.
+double cell_size_ratio(const ErrorLevel &level, const ErrorLevel &other)
+{
+  return std::cbrt(other.volume / static_cast<double>(other.cells) / (level.volume / static_cast<double>(level.cells)));
+}
+
+/// The values of number @p i on both levels, if both have it.
+std::optional<std::pair<double, double>> both(const ErrorLevel &a, const ErrorLevel &b, std::size_t i)
+{
+  if (i >= a.numbers.size() || i >= b.numbers.size() || !a.numbers[i].value || !b.numbers[i].value) return {};
+  return {{*a.numbers[i].value, *b.numbers[i].value}};
+}
+
+} // namespace
+
+TimeError time_error(double fine, double twice, double four_times, int order)
+{
+  const double near = fine - twice, far = twice - four_times;
+  if (near == 0 && far == 0) return {0, {}};
+  if (!(far / near > 0)) return {1.25 * std::max(std::abs(near), std::abs(far)), {}};
+  const double observed = std::log2(far / near), used = std::clamp(observed, 0.5, double(order)),
+               safety = std::abs(observed - order) <= 0.1 * order ? 1.25 : 3;
+  return {safety * std::abs(near) / (std::exp2(used) - 1), observed};
+}
+
+double space_error(double difference, double ratio)
+{
+  return std::abs(difference / (1 - ratio));
+}
+
+std::optional<double> ErrorBar::total() const
+{
+  return time && space && solver ? std::optional<double>(*time + *space + *solver) : std::nullopt;
+}
+
+double ErrorReport::extra_seconds() const
+{
+  double sum = 0;
+  for (std::size_t i = 1; i < levels.size(); ++i) sum += levels[i].seconds;
+  return sum;
+}
+
+PetscErrorCode ErrorEstimate::declare(Options &options)
+{
+  PetscFunctionBeginUser;
+  options.group("error_estimate", "numerical error bars");
+  PetscCall(options.flag("",
+                         "after the run, run again with steps 2 and 4 times as long, tighter tolerances and another "
+                         "mesh, and give each clinical number with its error in time, space and solver",
+                         in_use_));
+  PetscCall(options.text("mesh",
+                         "the other mesh: a coarser or finer one of the same lung; without it this one refined once "
+                         "(with -dm_refine: once less), which takes several times the memory",
+                         mesh_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode ErrorEstimate::check(const Options &options, const Scene &scene) const
+{
+  PetscFunctionBeginUser;
+  if (!in_use_) {
+    PulmoUserCheck(mesh_.empty(), options.comm(), "-error_estimate_mesh %s has no effect without -error_estimate",
+                   mesh_.c_str());
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+  PulmoUserCheck(scene.facts().ventilator, options.comm(),
+                 "-error_estimate gives the errors of clinical numbers: it needs -ventilator");
+  if (!mesh_.empty()) PetscCall(check_mesh_file(options.comm(), "-error_estimate_mesh", mesh_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode ErrorEstimate::coarser_steps(const Simulation &simulation, int factor, Changes &changes) const
+{
+  const StepControl &control = simulation.step_control();
+  const double looser = std::pow(factor, simulation.scheme().order() + 1); // a step's error is of order dt^(order + 1)
+  TSAdapt adapt;
+  PetscReal longest;
+
+  PetscFunctionBeginUser;
+  changes.emplace_back("-ts_dt", text_of(factor * simulation.wanted_dt()));
+  if (!control.in_use()) PetscFunctionReturn(PETSC_SUCCESS);
+  changes.emplace_back("-step_volume_tolerance", text_of(looser * control.volume_tolerance()));
+  changes.emplace_back("-step_pressure_tolerance", text_of(looser * control.pressure_tolerance()));
+  PetscCall(TSGetAdapt(simulation.ts(), &adapt));
+  PetscCall(TSAdaptGetStepLimits(adapt, nullptr, &longest));
+  changes.emplace_back("-ts_adapt_dt_max", text_of(factor * longest));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode ErrorEstimate::tighter_solver(const Simulation &simulation, Changes &changes) const
+{
+  SNES snes;
+  PetscReal absolute, relative, step;
+
+  PetscFunctionBeginUser;
+  PetscCall(TSGetSNES(simulation.ts(), &snes));
+  PetscCall(SNESGetTolerances(snes, &absolute, &relative, &step, nullptr, nullptr));
+  const auto tighten = [&](const char *option, PetscReal tolerance) {
+    if (tolerance > tightest) changes.emplace_back(option, text_of(std::max(tightest, tighter * tolerance)));
+  };
+  tighten("-snes_rtol", relative);
+  tighten("-snes_atol", absolute);
+  tighten("-snes_stol", step);
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode ErrorEstimate::other_mesh(Changes &changes, std::string &name) const
+{
+  PetscInt refined = 0;
+
+  PetscFunctionBeginUser;
+  if (!mesh_.empty()) {
+    changes.emplace_back("-dm_plex_filename", mesh_);
+    name = "mesh " + mesh_;
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+  PetscCall(PetscOptionsGetInt(nullptr, nullptr, "-dm_refine", &refined, nullptr));
+  changes.emplace_back("-dm_refine", std::to_string(refined > 0 ? refined - 1 : 1));
+  name = refined > 0 ? "mesh refined once less" : "mesh refined once";
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Runs the scene with @p changes to its options.
+PetscErrorCode ErrorEstimate::run_level(const Options &options, const Output &output, const Changes &changes,
+                                        ErrorLevel &level) const
+{
+  const MPI_Comm comm = options.comm();
+  Changes list;
+  PetscLogDouble begin, end;
+  bool finished;
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscTime(&begin));
+  PetscCall(options.all_given(list));
+  list.erase(std::remove_if(list.begin(), list.end(), [](const auto &o) { return is_output_option(o.first); }),
+             list.end());
+  list.insert(list.end(), changes.begin(), changes.end()); // the last one counts
+  OptionsInForce in_force;
+  PetscCall(in_force.put(list));
+
+  Run run(registry_);
+  PetscCall(run.declare());
+  PetscCall(run.setup());
+  Simulation &simulation = run.simulation();
+  ProgressPrinter progress(comm, run.scene().facts());
+  Sampling sampling;
+  RegionAudit regions(run.scene(), run.model(), sampling);
+  PetscCall(sampling.setup(run.model()));
+  PetscCall(regions.setup());
+  simulation.add(regions);
+  if (output.progress()) simulation.add(progress);
+  StopSignal signal(comm);
+  simulation.heed(signal);
+  PetscCall(simulation.run(finished));
+  PulmoUserCheck(!simulation.stopped(), comm,
+                 "stopped by %s while the errors were estimated; the run itself is whole in %s, without error bars",
+                 signal.name(), output.directory().c_str());
+  PetscCall(PetscTime(&end));
+  PetscCall(describe_level(simulation, run.scene(), level));
+  level.seconds = end - begin;
+  if (finished)
+    level.numbers = clinical_entries(overall_numbers(regions.complete(simulation.rows())),
+                                     run.scene().functional_residual_capacity());
+  else
+    level.failure = simulation.failure_text();
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode describe_level(const Simulation &simulation, const Scene &scene, ErrorLevel &level)
+{
+  PetscFunctionBeginUser;
+  level.dt = simulation.wanted_dt();
+  level.cells = scene.mesh().cells();
+  level.volume = scene.mesh().volume() / units::mm3_per_ml;
+  level.steps = static_cast<PetscInt>(simulation.rows().size()) - 1;
+  PetscCall(VecGetSize(simulation.state(), &level.dofs));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode ErrorEstimate::make(const Options &options, const Output &output, const Scene &scene,
+                                   const Simulation &simulation, const std::vector<ClinicalEntry> &numbers,
+                                   ErrorReport &report) const
+{
+  const MPI_Comm comm = options.comm();
+  enum { fine, twice, four_times, tight, other, n_levels };
+  std::array<Changes, n_levels> changes;
+  std::string mesh;
+
+  PetscFunctionBeginUser;
+  report.levels.assign(n_levels, {});
+  auto &levels = report.levels;
+  PetscCall(describe_level(simulation, scene, levels[fine]));
+  levels[fine].name = "the run itself";
+  levels[fine].seconds = simulation.seconds().total;
+  levels[fine].numbers = numbers;
+  PetscCall(coarser_steps(simulation, 2, changes[twice]));
+  PetscCall(coarser_steps(simulation, 4, changes[four_times]));
+  changes[tight] = changes[other] = changes[four_times];
+  PetscCall(tighter_solver(simulation, changes[tight]));
+  PetscCall(other_mesh(changes[other], mesh));
+  levels[twice].name = "steps twice as long";
+  levels[four_times].name = "steps 4 times as long";
+  levels[tight].name = "the same, tighter solver";
+  levels[other].name = "the same, " + mesh;
+  for (int i = twice; i < n_levels; ++i) {
+    PetscCall(PetscPrintf(comm, "\nError estimate, run %d of %d: %s\n", i, n_levels - 1, levels[i].name.c_str()));
+    PetscCall(run_level(options, output, changes[i], levels[i]));
+  }
+  PulmoUserCheck(std::abs(levels[other].volume / levels[fine].volume - 1) < same_lung, comm,
+                 "-error_estimate_mesh %s holds %.4g ml at rest and the scene's mesh %.4g ml: that is another lung",
+                 mesh_.c_str(), levels[other].volume, levels[fine].volume);
+  const double ratio = cell_size_ratio(levels[fine], levels[other]);
+  PulmoUserCheck(std::max(ratio, 1 / ratio) >= least_ratio, comm,
+                 "-error_estimate_mesh %s has cells %.3g times as large as the scene's mesh; give one whose cells are "
+                 "at least %.2g times larger or smaller",
+                 mesh_.c_str(), ratio, least_ratio);
+  for (std::size_t i = 0; i < numbers.size(); ++i) {
+    if (!numbers[i].value) continue;
+    ErrorBar bar;
+    bar.entry = numbers[i];
+    const auto short_steps = both(levels[fine], levels[twice], i),
+               long_steps = both(levels[twice], levels[four_times], i),
+               solver = both(levels[four_times], levels[tight], i), space = both(levels[four_times], levels[other], i);
+    if (short_steps && long_steps) {
+      const TimeError time =
+          time_error(short_steps->first, short_steps->second, long_steps->second, simulation.scheme().order());
+      bar.time = time.error;
+      bar.time_order = time.order;
+    }
+    if (solver) bar.solver = std::abs(solver->first - solver->second);
+    if (space) bar.space = space_error(space->first - space->second, ratio);
+    report.bars.push_back(bar);
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace pulmo

@@ -1,0 +1,125 @@
+#!/usr/bin/python3
+"""-error_estimate: error bars hold the numbers of a run far finer, on any number of ranks, and cost nothing of the run."""
+import os
+import unittest
+
+import pulmo_case as pc
+
+# a block of 1000 ml, 24 cells, one face airway; a breath whose pressure rises and falls over 0.2 s
+SCENE = (pc.BLOCK + pc.DIRECT + pc.QUIET +
+         ["-tissue", "yoshihara", "-airflow", "-airflow_permeability", "100", "-airflow_surfaces", "x1", "-chest_wall",
+          "-chest_wall_surfaces", "x0,y0,y1,z0,z1", "-ventilator", "pcv", "-ventilator_pip", "8", "-ventilator_inspiration", "0.8",
+          "-ventilator_expiration", "0.8", "-ventilator_ramp", "0.2", "-ventilator_ramp_down", "0.2", "-energy_audit", "off"])
+STEPS = ["-ts_dt", "0.05"]
+ESTIMATE = ["-error_estimate"]
+BDF2 = ["-ts_type", "bdf"]
+NUMBERS = ["tidal_volume_ml", "peak_flow_ml_per_s", "peak_expiratory_flow_ml_per_s", "compliance_ml_per_cmH2O",
+           "resistance_cmH2O_s_per_l", "time_constant_s", "dynamic_compliance_ml_per_cmH2O", "work_j", "auto_peep_cmH2O",
+           "trapped_volume_ml"]
+
+
+def bars(case):
+    return case.json()["error_estimate"]["numbers"]
+
+
+class ErrorEstimate(unittest.TestCase):
+    def bracketed(self, estimate, true_run, part):
+        """How many of the numbers lie within their bars of those of the true run; prints the effectivities."""
+        truth, inside = true_run.json(), 0
+        for key in NUMBERS:
+            bar = estimate[key]
+            error = abs(bar["value"] - truth[key])
+            inside += bar[part] >= error
+            print(f"  {key:34} {bar['value']:12.6g} error {error:9.3g} bar {bar[part]:9.3g} "
+                  f"effectivity {bar[part] / error if error else float('inf'):6.3g}")
+        return inside
+
+    def test_bars_in_time(self):
+        """Against steps 32 times as short with BDF2: one breath in 1024 steps."""
+        fine = pc.finished(SCENE + BDF2 + ["-ts_dt", "0.0015625"])
+        for name, scheme in (("backward Euler", []), ("BDF2", BDF2)):
+            with self.subTest(scheme=name):
+                print(f"\n{name}, 0.05 s, time:")
+                run = pc.finished(SCENE + STEPS + scheme + ESTIMATE)
+                self.assertGreaterEqual(self.bracketed(bars(run), fine, "time"), 9)
+
+    def test_bars_in_space(self):
+        """Against cells a quarter of the size; steps are the same."""
+        print("\nspace, 24 cells:")
+        steps = ["-ts_dt", "0.2"]
+        run = pc.finished(SCENE + steps + ESTIMATE)
+        fine = pc.finished(SCENE + steps + ["-dm_refine", "2"])
+        self.assertGreaterEqual(self.bracketed(bars(run), fine, "space"), 9)
+
+    def test_levels_and_the_run_itself(self):
+        plain = pc.finished(SCENE + STEPS)
+        with_bars = pc.finished(SCENE + STEPS + ESTIMATE)
+        before, after = plain.json(), with_bars.json()
+        for key in NUMBERS:
+            self.assertEqual(after[key], before[key])
+            self.assertEqual(bars(with_bars)[key]["value"], before[key])
+        levels = after["error_estimate"]["runs"]
+        self.assertEqual([level["dt_s"] for level in levels], [0.05, 0.1, 0.2, 0.2, 0.2])
+        self.assertEqual([level["cells"] for level in levels], [24, 24, 24, 24, 192])
+        # a level is what its options give by hand
+        by_hand = pc.finished(SCENE + ["-ts_dt", "0.2", "-dm_refine", "1"]).json()
+        for key in NUMBERS:
+            self.assertAlmostEqual(levels[4]["numbers"][key], by_hand[key], delta=1e-9 * abs(by_hand[key]) + 1e-12)
+        self.assertIn("± ", with_bars.out)
+        self.assertEqual(plain.files(), with_bars.files())
+
+    def test_another_mesh(self):
+        """A coarser mesh of the same block: cells twice as large, so the difference is the bar."""
+        other = ["-error_estimate_mesh", pc.mesh("cube_coarse.msh")]
+        fine = [pc.mesh("cube.msh") if o == pc.mesh("cube_coarse.msh") else o for o in SCENE]
+        run = pc.finished(fine + STEPS + ESTIMATE + other).json()["error_estimate"]
+        self.assertEqual([run["runs"][i]["cells"] for i in (0, 4)], [192, 24])
+        by_hand = [pc.finished(scene + ["-ts_dt", "0.2"]).json() for scene in (fine, SCENE)]
+        for key in NUMBERS:
+            difference = abs(by_hand[0][key] - by_hand[1][key])
+            self.assertAlmostEqual(run["numbers"][key]["space"], difference, delta=1e-6 * difference + 1e-12)
+
+    def test_refined_once_less(self):
+        run = pc.finished(SCENE + ["-ts_dt", "0.2", "-dm_refine", "1"] + ESTIMATE).json()["error_estimate"]
+        self.assertEqual([run["runs"][i]["cells"] for i in (0, 4)], [192, 24])
+
+    def test_ranks(self):
+        one, two = (bars(pc.finished(SCENE + STEPS + ESTIMATE, ranks=n)) for n in (1, 2))
+        for key in NUMBERS:
+            for part in ("time", "space"):
+                self.assertAlmostEqual(one[key][part], two[key][part], delta=1e-6 * abs(one[key]["value"]) + 1e-9)
+
+    def test_steps_by_their_error(self):
+        run = pc.finished(SCENE + BDF2 + ["-step_volume_tolerance", "0.5", "-ts_adapt_dt_max", "0.1"] + ESTIMATE).json()
+        steps = [level["steps"] for level in run["error_estimate"]["runs"]]
+        self.assertGreater(steps[0], 1.4 * steps[1])
+        self.assertGreater(steps[1], 1.2 * steps[2])
+
+    def test_a_level_that_fails(self):
+        """Newton steps that suffice for 0.05 s, not for 0.2 s: the run is whole, its bars are empty and say why."""
+        case = pc.finished(SCENE + STEPS + ["-snes_max_it", "3", "-ts_adapt_dt_min", "0.051"] + ESTIMATE)
+        levels = case.json()["error_estimate"]["runs"]
+        self.assertEqual(["failure" in level for level in levels], [False, False, True, True, True])
+        self.assertIsNone(bars(case)["tidal_volume_ml"]["error"])
+        self.assertIn("?: steps 4 times as long: no step could be accepted", case.out)
+
+    def test_refused(self):
+        def said(options, *words):
+            case = pc.Case(options)
+            self.assertNotEqual(case.code, 0)
+            for word in words:
+                self.assertIn(word, case.err)
+            return case
+
+        said(SCENE + ["-error_estimate_mesh", "x.msh"], "-error_estimate_mesh x.msh", "-error_estimate")
+        case = said(SCENE + ESTIMATE + ["-error_estimate_mesh", "none.msh"], "-error_estimate_mesh none.msh", "no such file")
+        self.assertFalse(os.path.exists(case.directory))
+        still = pc.BLOCK + pc.DIRECT + pc.QUIET + ["-tissue", "yoshihara", "-chest_wall", "-chest_wall_surfaces", "x0"]
+        said(still + ESTIMATE, "-error_estimate", "-ventilator")
+        for mesh, words in ((pc.mesh("cube_coarse.msh"), "as large as"), (pc.mesh("cube_msh22_ascii.msh"), "x1")):
+            case = said(SCENE + ["-ts_dt", "0.2"] + ESTIMATE + ["-error_estimate_mesh", mesh], words)
+            self.assertIn("tidal_volume_ml", case.json())  # the run itself is whole
+
+
+if __name__ == "__main__":
+    pc.main()
