@@ -86,8 +86,7 @@ std::optional<std::pair<double, double>> both(const ErrorLevel &a, const ErrorLe
 TimeError time_error(double fine, double twice, double four_times, int order)
 {
   const double near = fine - twice, far = twice - four_times;
-  if (near == 0 && far == 0) return {0, {}};
-  if (!(far / near > 0)) return {1.25 * std::max(std::abs(near), std::abs(far)), {}};
+  if (near == 0 || !(far / near > 0)) return {1.25 * std::max(std::abs(near), std::abs(far)), {}};
   const double observed = std::log2(far / near), used = std::clamp(observed, 0.5, double(order)),
                safety = std::abs(observed - order) <= 0.1 * order ? 1.25 : 3;
   return {safety * std::abs(near) / (std::exp2(used) - 1), observed};

@@ -10,7 +10,7 @@
 //     z1             z essential, else   flux    P N, Q.N
 //                           traction
 #include "support/scene.hpp"
-#include "verification/mms/manufactured.hpp"
+#include "verification/mms/sources.hpp"
 #include "verification/support/fields.hpp"
 #include "verification/support/integrators.hpp"
 #include "verification/support/scene_parts.hpp"
@@ -23,75 +23,6 @@ using namespace pulmo;
 using namespace pulmo::test;
 
 namespace {
-
-constexpr double spring = 0.8; ///< kPa/mm
-
-/// The permeability of the manufactured problems with its derivative by hand.
-struct RationalPermeability {
-  static constexpr const char *name = "rational";
-  struct Parameters {
-    static constexpr const char *owner = "permeability";
-    PetscScalar k0 = mms::k0;
-  };
-  static PetscErrorCode declare(Options &, Parameters &) { return PETSC_SUCCESS; }
-  static PermeabilityValue permeability(PetscScalar J, const Parameters &p)
-  {
-    const double q = 2 - J / 2;
-    return {p.k0 * J * J / q, p.k0 * (2 * J / q + J * J / (2 * q * q))};
-  }
-};
-
-/// Loads that make Solution solve the problem.
-template <class Law, class Solution>
-struct Sources {
-  using P = NoParameters;
-  static mms::State exact(const Point &point) { return mms::state<Law, Solution>(point.t, point.x); }
-
-  // strong form: body force, mass source, tractions, outward flux. Over a step the source holds the exact increment of
-  // J, so that backward Euler makes no error and what is left is the error in space.
-  static void body_force(const Point &point, const P &, PetscScalar f0[])
-  {
-    const mms::State s = exact(point);
-    for (int i = 0; i < 3; ++i) f0[i] -= s.B[i];
-  }
-  static void mass_source(const Point &point, const P &, PetscScalar f0[])
-  {
-    const double dt = point.step.dt;
-    const mms::State s = exact(point);
-    f0[0] -= (s.J - mms::J_of<Solution>(point.t - dt, point.x)) / dt + s.div_Q;
-  }
-  enum class Wall { plain, sprung, pressurised };
-  template <Wall W>
-  static void traction(const Point &point, const P &, PetscScalar f0[])
-  {
-    const mms::State s = exact(point);
-    for (int i = 0; i < 3; ++i) {
-      double T = W == Wall::sprung ? spring * s.u[i] : 0;
-      for (int j = 0; j < 3; ++j)
-        T += (s.P[3 * i + j] + (W == Wall::pressurised ? s.p * s.cof_F[3 * i + j] : 0)) * point.normal[j];
-      f0[i] -= T;
-    }
-  }
-  static void outflow(const Point &point, const P &, PetscScalar f0[])
-  {
-    const mms::State s = exact(point);
-    for (int i = 0; i < 3; ++i) f0[0] += s.Q[i] * point.normal[i];
-  }
-
-  // weak form, for the order in time: the exact stress, flux and rate of J against the test functions, so that the
-  // interpolant solves the semi-discrete problem exactly and what is left is the error in time.
-  static void stress(const Point &point, const P &, PetscScalar f1[])
-  {
-    const mms::State s = exact(point);
-    for (int i = 0; i < 9; ++i) f1[i] -= s.P[i];
-  }
-  static void rate(const Point &point, const P &, PetscScalar f0[]) { f0[0] -= exact(point).dJ_dt; }
-  static void flux(const Point &point, const P &, PetscScalar f1[])
-  {
-    const mms::State s = exact(point);
-    for (int i = 0; i < 3; ++i) f1[i] += s.Q[i];
-  }
-};
 
 template <class Law, class Solution>
 class ManufacturedLoads final : public Effect {
@@ -107,7 +38,7 @@ public:
   bool active() const override { return true; }
   PetscErrorCode terms(Composition &c, const SceneFacts &) const override
   {
-    using S = Sources<Law, Solution>;
+    using S = mms::Sources<Law, Solution>;
     using P = NoParameters;
     using Wall = typename S::Wall;
     if (weak_) {
@@ -133,39 +64,19 @@ private:
   bool weak_;
 };
 
-/// Values of the solution and of its gradients.
-template <class Solution>
-void values(double t, const double x[3], double u[3], double grad_u[9], double &p, double grad_p[3])
-{
-  using D = mms::Dual<double, 4>;
-  D X[4], U[3];
-  for (int i = 0; i < 4; ++i) {
-    X[i].v = i < 3 ? x[i] : t;
-    X[i].d[i] = 1;
-  }
-  Solution::displacement(X, U);
-  const D pressure_value = Solution::pressure(X);
-  p = pressure_value.v;
-  for (int i = 0; i < 3; ++i) {
-    u[i] = U[i].v;
-    grad_p[i] = pressure_value.d[i];
-    for (int j = 0; j < 3; ++j) grad_u[3 * i + j] = U[i].d[j];
-  }
-}
-
 template <class Law, class Solution>
 Registry manufactured(bool weak)
 {
   Registry r = Registry::standard();
-  r.permeability_law<RationalPermeability>();
+  r.permeability_law<mms::RationalPermeability>();
   r.effect([weak] { return std::make_unique<ManufacturedLoads<Law, Solution>>(weak); });
   const auto u = [](PetscReal t, const PetscReal x[3], PetscScalar v[3]) {
     double grad_u[9], p, grad_p[3];
-    values<Solution>(t, x, v, grad_u, p, grad_p);
+    mms::values<Solution>(t, x, v, grad_u, p, grad_p);
   };
   const auto p = [](PetscReal t, const PetscReal x[3], PetscScalar v[3]) {
     double u_values[3], grad_u[9], grad_p[3];
-    values<Solution>(t, x, u_values, grad_u, v[0], grad_p);
+    mms::values<Solution>(t, x, u_values, grad_u, v[0], grad_p);
   };
   add_essential(r, displacement, "x0", u);
   add_essential(r, displacement, "y0", u);
@@ -185,7 +96,7 @@ std::string options(const char *law, const std::string &mesh, double dt, bool we
          (weak ? ""
                : " -lumen_pressure -lumen_pressure_surfaces y1 -chest_wall -chest_wall_surfaces x1 "
                  "-chest_wall_stiffness " +
-                     std::to_string(spring));
+                     std::to_string(mms::spring));
 }
 
 struct Errors {
@@ -199,7 +110,7 @@ PetscErrorCode errors(DM dm, Vec local, double t, Errors &e)
   e = Errors();
   PetscCall(sample_rule(dm, local, 6, [&](const Sample &s) {
     double u[3], grad_u[9], p, grad_p[3];
-    values<Solution>(t, s.x, u, grad_u, p, grad_p);
+    mms::values<Solution>(t, s.x, u, grad_u, p, grad_p);
     const auto square = [](double v) { return v * v; };
     for (int i = 0; i < 3; ++i) e.u += s.weight * square(s.u[i] - u[i]);
     for (int i = 0; i < 9; ++i) e.grad_u += s.weight * square(s.grad_u[i] - grad_u[i]);
@@ -303,7 +214,7 @@ private:
       double u[3], grad_u[9], p, grad_p[3];
       PetscFunctionBeginUser;
       PetscCall(run_->scene().mesh().node_coordinates(point, x));
-      values<Solution>(t, x, u, grad_u, p, grad_p);
+      mms::values<Solution>(t, x, u, grad_u, p, grad_p);
       WriteArray a(local);
       for (PetscInt i = 0; i < n; ++i) a[first + i] = field == displacement ? u[i] : p;
       PetscFunctionReturn(PETSC_SUCCESS);
