@@ -105,12 +105,12 @@ PetscErrorCode labelled_points(DM dm, const char *name, PetscInt begin, PetscInt
 
 } // namespace
 
-PetscErrorCode Mesh::require_openings(const std::vector<std::string> &names, const std::string &option) const
+PetscErrorCode Mesh::require_in_each_body(const std::vector<std::string> &names, const std::string &complaint) const
 {
   const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
   PetscInt begin, end, last = -1;
   std::vector<PetscInt> body;
-  std::set<PetscInt> open; // bodies
+  std::set<PetscInt> reached; // bodies
 
   PetscFunctionBeginUser;
   PetscCall(DMPlexGetDepthStratum(dm_, 0, &begin, &end));
@@ -122,15 +122,15 @@ PetscErrorCode Mesh::require_openings(const std::vector<std::string> &names, con
       const PetscInt *cone;
       PetscCall(DMPlexGetCone(dm_, facet, &cone));   // edges
       PetscCall(DMPlexGetCone(dm_, cone[0], &cone)); // vertices
-      open.insert(body[cone[0] - begin]);
+      reached.insert(body[cone[0] - begin]);
     }
   }
   for (;;) {
     PetscInt next;
-    PetscReal sums[5] = {0, 0, 0, 0, 0}; // coordinates and number of the body's vertices, ranks where it is open
+    PetscReal sums[5] = {0, 0, 0, 0, 0}; // coordinates and number of the body's vertices, ranks where it is reached
     PetscCall(next_body(comm, body, last, next));
     if (next == PETSC_MAX_INT) break;
-    sums[4] = static_cast<PetscReal>(open.count(next));
+    sums[4] = static_cast<PetscReal>(reached.count(next));
     for (PetscInt v = begin; v < end; ++v) {
       PetscReal x[3];
       if (body[v - begin] != next) continue;
@@ -139,12 +139,9 @@ PetscErrorCode Mesh::require_openings(const std::vector<std::string> &names, con
       ++sums[3];
     }
     PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, sums, 5, MPIU_REAL, MPI_SUM, comm));
-    PulmoUserCheck(
-        sums[4] > 0, comm,
-        "the body around (%.6g, %.6g, %.6g) mm of mesh %s is joined to no facet that %s names, so that no air "
-        "gets in; name its opening, or join the bodies or remove this one in gmsh",
-        (double)(sums[0] / sums[3]), (double)(sums[1] / sums[3]), (double)(sums[2] / sums[3]), file_.c_str(),
-        option.c_str());
+    PulmoUserCheck(sums[4] > 0, comm, "the body around (%.6g, %.6g, %.6g) mm of mesh %s %s",
+                   (double)(sums[0] / sums[3]), (double)(sums[1] / sums[3]), (double)(sums[2] / sums[3]), file_.c_str(),
+                   complaint.c_str());
     last = next;
   }
   PetscFunctionReturn(PETSC_SUCCESS);

@@ -2,6 +2,8 @@
 
 #include "pulmo/checkpoint.hpp"
 
+#include <algorithm>
+
 namespace pulmo {
 
 namespace {
@@ -85,6 +87,25 @@ PetscErrorCode keep_last_state(Checkpoint &checkpoint, const Simulation &simulat
   PetscCall(checkpoint.write(complaint));
   text = complaint.empty() ? " With another solver go on from there: -restart " + checkpoint.path() + "."
                            : " No checkpoint: " + complaint + ".";
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Refuses a lung, or one of several bodies, that nothing holds in place.
+PetscErrorCode check_held(MPI_Comm comm, const Scene &scene, const Composition &composition)
+{
+  const std::vector<std::string> surfaces = composition.holding_surfaces();
+
+  PetscFunctionBeginUser;
+  PulmoUserCheck(
+      !surfaces.empty(), comm,
+      "nothing holds the lung in place: give -chest_wall (springs), or -support -support_rigid to let it move "
+      "freely but for the six rigid-body motions");
+  const bool everywhere = std::find(surfaces.begin(), surfaces.end(), "") != surfaces.end();
+  if (!everywhere)
+    PetscCall(scene.mesh().require_in_each_body(
+        surfaces,
+        "is held in place by nothing: name a surface of it with -chest_wall_surfaces or -support_surfaces, or "
+        "join the bodies in gmsh"));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -183,10 +204,7 @@ PetscErrorCode run(const Registry &registry, bool &finished)
     finished = true;
     PetscFunctionReturn(PETSC_SUCCESS);
   }
-  PulmoUserCheck(
-      run.model().composition().held(), comm,
-      "nothing holds the lung in place: give -chest_wall (springs), or -support -support_rigid to let it move "
-      "freely but for the six rigid-body motions");
+  PetscCall(check_held(comm, scene, run.model().composition()));
   PetscCall(error_estimate.check(options, scene));
 
   SignalWriter signals(comm, output, scene.facts());

@@ -165,14 +165,16 @@ public:
       if (c.field == displacement) return true;
     return false;
   }
-  /// Whether anything at all holds the lung: a prescribed displacement, or a term that resists displacement itself.
-  /// (It may still be too little to stop every rigid motion.)
-  bool held() const
+  /// The surfaces where something holds the lung: a prescribed displacement, or a term that resists displacement
+  /// itself; an empty name stands for all of the lung. (It may still be too little to stop every rigid motion.)
+  std::vector<std::string> holding_surfaces() const
   {
-    if (supported()) return true;
+    std::vector<std::string> list;
+    for (const Constraint &c : constraints_)
+      if (c.field == displacement) list.push_back(c.surface);
     for (const Term &t : terms_)
-      if (t.test == displacement && t.trial == displacement && (t.g0 || t.bd_g0)) return true;
-    return false;
+      if (t.test == displacement && t.trial == displacement && (t.g0 || t.bd_g0)) list.push_back(t.surface);
+    return list;
   }
 
   const std::vector<FieldSpec> &fields() const { return fields_; }

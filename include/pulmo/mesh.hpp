@@ -50,8 +50,9 @@ public:
 
   /// User error, naming @p option and the surfaces that exist, unless all @p names are surfaces of the mesh.
   PetscErrorCode require_surfaces(const std::vector<std::string> &names, const std::string &option) const;
-  /// User error, naming @p option and the place, unless every connected body has facets of one of these surfaces.
-  PetscErrorCode require_openings(const std::vector<std::string> &names, const std::string &option) const;
+  /// User error, naming the place and ending with @p complaint, unless every connected body has facets of one of these
+  /// surfaces.
+  PetscErrorCode require_in_each_body(const std::vector<std::string> &names, const std::string &complaint) const;
   /// Three vertices of each connected body and 3, 2, 1 components that remove exactly its six rigid-body modes.
   PetscErrorCode rigid_pins(std::vector<Pin> &pins) const;
   /// Every connected body and every named part of the volume. A body without a name of its own is called body_1, ...,

@@ -14,6 +14,7 @@ import meshio
 import numpy as np
 
 import pulmo_case as pulmo
+from case_meshes import bodies
 
 NO_MESH = pulmo.DIRECT + pulmo.PCV
 LIMIT = 30  # s, on a busy machine; a hang would take for ever
@@ -381,6 +382,10 @@ def table(m):
         "a support that holds nothing": (good + ["-support"], ["-support", "-support_surfaces", "-support_rigid"]),
         "nothing holds the lung": (pulmo.DIRECT + ["-dm_plex_filename", m["good"], "-ventilator", "pcv"],
                                    ["-chest_wall", "-support_rigid"]),
+        "nothing holds one of two bodies": (pulmo.DIRECT + bodies("stiff", "soft") +
+                                            ["-ventilator", "pcv", "-airflow", "-chest_wall", "-chest_wall_surfaces", "stiff"],
+                                            ["the body around (1", "held in place by nothing", "-chest_wall_surfaces",
+                                             "-support_surfaces"]),
         # modes of the ventilator
         "pip of volume control": (lung + ["-ventilator", "vcv", "-ventilator_pip", "6"],
                                   ["-ventilator_pip", "no effect", "-ventilator pcv"]),
@@ -549,7 +554,8 @@ class InputErrors(unittest.TestCase):
         shared = {"one cell inverted", "tangled mesh", "flat mesh", "mesh in metres", "a body without an airway",
                   "a surface within the volume", "a name for two groups", "mesh of no names", "missing airway",
                   "missing mesh", "junk mesh", "a facet of no cell", "a torn mesh", "missing programme", "empty programme",
-                  "a wrong line", "nothing holds the lung", "output where a file is", "output below a file"}
+                  "a wrong line", "nothing holds the lung", "nothing holds one of two bodies",
+                  "output where a file is", "output below a file"}
         self.assertLessEqual(shared, set(self.table))
         self.run_table(2, [name for i, name in enumerate(self.table) if i % 2 or name in shared])
 

@@ -184,7 +184,7 @@ PetscErrorCode read_mesh(const std::string &file)
   PetscCall(mesh.declare(options));
   PetscCall(mesh.read(options, true));
   PetscCall(mesh.require_surfaces({"airway", "pleura"}, "-some_surfaces"));
-  PetscCall(mesh.require_openings({"airway"}, "-some_surfaces"));
+  PetscCall(mesh.require_in_each_body({"airway"}, "has no airway"));
   PetscCall(mesh.regions(regions));
   PetscCall(mesh.rigid_pins(pins));
   PetscFunctionReturn(PETSC_SUCCESS);

@@ -152,7 +152,9 @@ public:
   {
     PetscFunctionBeginUser;
     PetscCall(mesh.require_surfaces(surfaces_, "-airflow_surfaces"));
-    PetscCall(mesh.require_openings(surfaces_, "-airflow_surfaces"));
+    PetscCall(mesh.require_in_each_body(surfaces_,
+                                        "is joined to no facet that -airflow_surfaces names, so that no air gets in; "
+                                        "name its opening, or join the bodies or remove this one in gmsh"));
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
