@@ -19,12 +19,12 @@ constexpr PetscReal same_time = 1e-9;
 constexpr PetscReal stretch = 0.01;
 
 /// A step cut below this share of the one asked for ends the run (-ts_adapt_dt_min may end it earlier).
-constexpr PetscReal least_step = 1e-6;
+constexpr PetscReal least_step = 1e-5;
 
 /// So do as many accepted steps in a row below this share of the step asked for: the run only crawls towards a state
 /// that it cannot pass.
 constexpr PetscReal crawling_step = 1e-3;
-constexpr int crawling_steps = 50;
+constexpr int crawling_steps = 20;
 
 /// A Krylov method solves for z (Simulation::border) to a share of its right-hand side, which grows with the
 /// permeability; it is solved on, so many times at most, until what is left of it adds less than this share to the
@@ -620,7 +620,7 @@ std::string Simulation::failure_text() const
   text << (crawled_ >= crawling_steps ? "steps only crawl at t = " : "no step could be accepted after t = ")
        << accepted_.time << " s (phase " << (phase_ ? phase_->name : "run") << ", airway pressure "
        << accepted_.pressure << " cmH2O, volume " << accepted_.volume << " ml, tissue law "
-       << scene_.tissue().law().name() << ", smallest J " << accepted_.min_J << ").";
+       << scene_.tissue().law().name() << ", J from " << accepted_.min_J << " to " << accepted_.max_J << ").";
   const auto inverted = std::find_if(failures_.rbegin(), failures_.rend(), [](const auto &f) { return f.inverted; });
   if (inverted != failures_.rend())
     text << " The tissue turned inside out: J = " << inverted->measures.min_J << " in the cell at ("
