@@ -56,6 +56,20 @@ PetscErrorCode newton_step(SNESLineSearch search, Vec X, Vec Y, PetscBool *chang
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+constexpr const char *owner = "pulmo_simulation"; ///< of a matrix that is composed with it
+
+PetscErrorCode matrix_product(Mat A, Vec x, Vec y)
+{
+  PetscContainer container;
+  void *simulation;
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscObjectQuery((PetscObject)A, owner, (PetscObject *)&container));
+  PetscCall(PetscContainerGetPointer(container, &simulation));
+  PetscCall(static_cast<Simulation *>(simulation)->product(x, y));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode newton_converged(SNES snes, PetscInt it, PetscReal xnorm, PetscReal ynorm, PetscReal fnorm,
                                 SNESConvergedReason *reason, void *simulation)
 {
@@ -194,9 +208,17 @@ PetscErrorCode Simulation::create_solver()
     }
     PetscCall(SNESGetLineSearch(snes, &search));
     PetscCall(SNESLineSearchSetPreCheck(search, newton_step, this));
+    PetscContainer self; // the search for a smaller residual multiplies by the matrix to know the slope
+    PetscCall(PetscContainerCreate(comm, &self));
+    PetscCall(PetscContainerSetPointer(self, this));
+    PetscCall(PetscObjectCompose((PetscObject)(Mat)matrix_, owner, (PetscObject)self));
+    PetscCall(PetscContainerDestroy(&self));
+    PetscCall(MatGetOperation(matrix_, MATOP_MULT, &multiply_));
+    PetscCall(MatSetOperation(matrix_, MATOP_MULT, (void (*)())matrix_product));
     PetscCall(VecDuplicate(state_, border_x_.out()));
     PetscCall(VecDuplicate(state_, border_b_.out()));
     PetscCall(VecDuplicate(state_, border_z_.out()));
+    PetscCall(VecDuplicate(state_, border_r_.out()));
     PetscCall(VecDuplicate(local_, border_y_.out()));
   }
   PetscCall(TSGetTimeStep(ts_, &wanted_dt_));

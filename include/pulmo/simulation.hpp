@@ -94,6 +94,9 @@ public:
   PetscErrorCode guess(SNES snes, Vec X);
   /// Completes the Newton step @p Y of a solution @p X whose airway pressure is an unknown: one more right-hand side.
   PetscErrorCode border(SNES snes, Vec X, Vec Y);
+  /// The matrix times @p x. Along a bordered step the rate of change of the residual is minus the residual, as along
+  /// any Newton step; the matrix lacks the column and the row of the airway pressure.
+  PetscErrorCode product(Vec x, Vec y);
   /// PETSc's test, but a prescribed volume must be met too.
   PetscErrorCode converged(SNES snes, PetscInt it, PetscReal xnorm, PetscReal ynorm, PetscReal fnorm,
                            SNESConvergedReason *reason);
@@ -146,7 +149,7 @@ private:
   TSHandle ts_;
   MatHandle matrix_;
   VecHandle state_, local_, rate_, local_residual_, before_;
-  VecHandle border_x_, border_b_, border_z_, border_y_; ///< global; the last one local
+  VecHandle border_x_, border_b_, border_z_, border_r_, border_y_; ///< global; the last one local
   std::vector<Phase> phases_;
   const Phase *phase_ = nullptr;
   PetscReal wanted_dt_ = 0.05, dt_ = 0.05; ///< asked for; in use before any shortening to land on a time
@@ -156,13 +159,15 @@ private:
   std::vector<SignalRow> rows_;
   PetscReal delivered_ = 0, worst_balance_ = 0, worst_reaction_ = 0, min_J_ = 1;
   PetscInt newton_ = 0, krylov_ = 0, rejected_ = 0;
-  PetscReal start_norm_ = 0; ///< residual of the attempt at hand before any Newton step and guess
-  int extra_newton_ = 0;     ///< Newton steps of the attempt at hand for the prescribed volume alone
-  bool inverted_ = false;    ///< the attempt at hand met J <= 0
-  bool cut_ = false;         ///< the step at hand was cut
-  bool resumed_ = false;     ///< the run goes on from what was read
-  bool stopped_ = false;     ///< by a signal
-  int crawled_ = 0;          ///< accepted steps in a row that were tiny
+  void (*multiply_)() = nullptr; ///< PETSc's product with matrix_
+  Vec bordered_ = nullptr;       ///< residual at the start of a bordered step, until the search along it begins
+  PetscReal start_norm_ = 0;     ///< residual of the attempt at hand before any Newton step and guess
+  int extra_newton_ = 0;         ///< Newton steps of the attempt at hand for the prescribed volume alone
+  bool inverted_ = false;        ///< the attempt at hand met J <= 0
+  bool cut_ = false;             ///< the step at hand was cut
+  bool resumed_ = false;         ///< the run goes on from what was read
+  bool stopped_ = false;         ///< by a signal
+  int crawled_ = 0;              ///< accepted steps in a row that were tiny
   Measures inverted_measures_;
   std::vector<FailedAttempt> failures_;
   StageSeconds seconds_;

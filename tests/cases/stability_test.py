@@ -85,6 +85,19 @@ class Stability(unittest.TestCase):
                 np.testing.assert_allclose(rows["airway_pressure_cmH2O"], pip * np.minimum(1, time / (ramp or 0.05)),
                                            rtol=1e-9)
 
+    def test_bordered_steps_at_very_high_permeability(self):
+        """The airway pressure's column grows with k: the search along the step and the second solve must know of it."""
+        for solver, ranks in ("direct", 1), ("iterative", 1), ("iterative", 2):
+            with self.subTest(solver, ranks=ranks):
+                case = pulmo.finished(pulmo.options_file(f"solvers/{solver}.opts") + pulmo.VCV + pulmo.LITRE + pulmo.COMMON + QUIET + [
+                    "-tissue", "yoshihara", "-ventilator_tidal_volume", 250, "-airflow_permeability", 1e10, "-ts_max_time", 0.3],
+                    ranks=ranks)
+                rows, summary = case.signals(), case.json()
+                self.assertEqual(summary["rejected_steps"], 0)
+                self.assertLess(rows["newton_iterations"].max(), 10)
+                self.assertLess(summary["krylov_iterations"], 15 * summary["newton_iterations"])
+                np.testing.assert_allclose(rows["volume_ml"], 250 * rows["time_s"], rtol=1e-9, atol=1e-9)
+
 
 class Gallery(unittest.TestCase):
     """tools/hard_cases at the size of a test."""

@@ -4,6 +4,7 @@ import random
 
 from . import meshes
 from .lab import case, case_meshes, first_sentence, pulmo
+from .laws import says_where
 
 TISSUE = {"berger": {"mu": 0.2808, "lambda": 0.4212}, "ma": {"c": 2}, "birzle": {"c": 0.3567, "c1": 0.2782, "c3": 5.766e-3},
           "yoshihara": {"c": 1.298, "beta": 0.75}, "rausch": {"c_q": 4.1, "c_c": 20.7, "kappa": 16.5}}
@@ -16,8 +17,9 @@ def between(dice, low, high):
 
 
 def programme(dice, volume):
-    """Phases of pressure, flow and hold that a ventilator could be set to; the lung never holds more than 70 % of itself."""
-    lines, inside = [], 0.0
+    """Phases of pressure, flow and hold that a ventilator could be set to; a flow brings the lung to 70 % more than itself at
+    most, and takes away half of what is surely in it."""
+    lines, least, most = [], 0.0, 0.0  # gas inside
     for _ in range(dice.randint(2, 5)):
         duration = between(dice, 0.05, 0.6)
         kind = dice.choice(["pressure", "flow", "hold"])
@@ -26,11 +28,11 @@ def programme(dice, volume):
         elif kind == "pressure":
             ramp = f" ramp {dice.choice([0.2, 0.9]) * duration:.4g}" if dice.random() < 0.6 else ""
             lines.append(f"{dice.choice(['inspiration', 'expiration'])} {duration} pressure {dice.uniform(-5, 25):.4g}{ramp}")
-            inside = 0.3 * volume
+            least, most = 0.0, 0.3 * volume
         else:
-            into = dice.uniform(-0.5 * inside, 0.7 * volume - inside)
-            inside += max(into, 0)
+            into = dice.uniform(-0.5 * least, 0.7 * volume - most)
             limit = f" limit {dice.uniform(5, 30):.4g}" if dice.random() < 0.3 and into > 0 else ""
+            least, most = least + (0 if limit else into), most + max(into, 0)
             lines.append(f"inspiration {duration} flow {into / duration:.4g}{limit}")
     return "\n".join(lines)
 
@@ -62,8 +64,11 @@ def scene(dice):
             options.append("-lumen_pressure")
         if dice.random() < 0.2:
             options += ["-airflow_porosity", dice.choice([0.5, 0.8, 0.95])]
-    if dice.random() < 0.75:
-        options += ["-chest_wall", "-chest_wall_stiffness", between(dice, 1e-3, 10) / size,
+    # gas on the airway's wall pushes the lung as a whole: springs have to carry that, and within the lung's own length; free
+    # CM5 has no shear stiffness in any state
+    pushed = "-lumen_pressure" in options
+    if dice.random() < 0.75 or pushed or law == "rausch":
+        options += ["-chest_wall", "-chest_wall_stiffness", between(dice, 0.1 if pushed else 1e-3, 10) / size,
                     "-chest_wall_direction", dice.choice(["full", "full", "normal"])]
         if "normal" in options:  # flat faces: normal springs leave motions free only on meshes like these
             options += ["-support", "-support_rigid"]
@@ -90,11 +95,13 @@ def scene(dice):
             "-ts_adapt_dt_min", 1e-6, "-ts_max_time", 0.8], ranks, text)
 
 
-@case("Random admissible scenes (seeded)", "no crash, hang, NaN, trace or silence; nearly all finish", "185 of 200 seeds")
+@case("Random admissible scenes (seeded)",
+      "no crash, hang, NaN, trace or silence; what stops says where tissue folds or that a limit point is reached", "185 of 200 seeds")
 def fuzz(lab):
     """Laws, parameters, meshes, springs, permeabilities, manoeuvres, steps, solvers and ranks drawn together: combinations that
-    nobody thought of."""
-    count, finished, stopped, faults = (15 if lab.small else 200), 0, 0, []
+    nobody thought of. Many have no equilibrium: CM1 to CM4 fold at the airway's rim under the paper's traction, CM4 has a limit
+    point."""
+    count, ends, faults, unexplained = (15 if lab.small else 200), dict.fromkeys(("finished", "limit", "fold"), 0), [], []
     for seed in range(count):
         options, ranks, text = scene(random.Random(seed))
         try:
@@ -107,10 +114,14 @@ def fuzz(lab):
         if fault:
             faults.append(f"seed {seed}: {fault}")
         elif run.finished:
-            finished += 1
+            ends["finished"] += 1
+        elif "There is no equilibrium above" in run.err:
+            ends["limit"] += 1
+        elif says_where(run):
+            ends["fold"] += 1
         else:
-            stopped += 1
-    lab.demand(f"scenes that finished with J > 0 ({stopped} stopped with one clear sentence)", finished, f"≥ {0.8 * count:.0f} of {count}",
-               finished >= 0.8 * count)
+            unexplained.append(f"seed {seed}: {run.sentence[:60]}")
+    lab.demand(f"what stops is at a limit point or folds ({ends['finished']} finished with J > 0, {ends['limit']} stopped at a limit "
+               f"point, {ends['fold']} at a fold)", "; ".join(unexplained) or "all", "all", not unexplained)
     lab.demand("crash, NaN in a file, hang, PETSc trace, silence", "; ".join(faults[:6]) or "none", "none", not faults)
     lab.said = lab.said[:1]

@@ -2,7 +2,7 @@
 import numpy as np
 from scipy.optimize import brentq, minimize_scalar
 
-from .lab import case, pulmo
+from .lab import case, number, pulmo
 
 FREE = pulmo.DIRECT + pulmo.STILL + pulmo.PINS  # no airflow, no springs: F = J^(1/3) I, p = dW/dJ
 LAWS = ["berger", "ma", "birzle", "yoshihara", "rausch"]
@@ -19,6 +19,13 @@ def inflated(law, pressure, low, high):
     return brentq(lambda J: pulmo.gas_pressure(law, J) - pressure, low, high, xtol=1e-13)
 
 
+def ma_soft_in_shear():
+    """J of isotropic compression at which CM2 is no longer elliptic: F = λ I, and d²W(F + s a ⊗ N)/ds² = 0 for a ⊥ N."""
+    a, b = 0.43, -0.6
+    S, shear = 2 * (3 * a + b), -b / 2  # of W: stress per strain (λ² − 1)/2, shear modulus
+    return (S / (S + 2 * shear)) ** 1.5
+
+
 def limit_point():
     """J and p (cmH2O) of CM4's maximum of dW/dJ."""
     top = minimize_scalar(lambda J: -pulmo.gas_pressure("yoshihara", J), bounds=(1, 6), method="bounded",
@@ -26,11 +33,13 @@ def limit_point():
     return top.x, -top.fun
 
 
-@case("Near-collapse: suction of 20 cmH2O, and far beyond", "closed forms of J, also of CM1 at 2000 cmH2O; the porosity and the warning when it is negative",
+@case("Near-collapse: suction of 20 cmH2O, and far beyond", "closed forms of J, also of CM1 at 2000 cmH2O; the porosity and the warning when it is negative; "
+      "on the lung CM2 holds until it is no longer elliptic",
       "the lung with CM2, CM4 and CM5")
 def suction(lab):
     """J falls towards 1 − Φ0, where no air is left. CM2 to CM5 have no barrier there: nothing in the model keeps the
-    porosity positive, so pulmo has to say when it is not."""
+    porosity positive, so pulmo has to say when it is not. CM2 has no shear stiffness below J = 0.58: on the lung there is nothing left to
+    converge to."""
     for law in LAWS:
         run = lab.finished(FREE + pulmo.BLOCK + ["-tissue", law] + pulmo.programme("suction 1 pressure -20 ramp 1"),
                            f"{law} at −20 cmH2O")
@@ -44,8 +53,13 @@ def suction(lab):
         lab.within("J − (1 − Φ0) of berger at −2000 cmH2O, free", run.signals()["min_J"][-1] - 0.01,
                    inflated("berger", -2000, 0.0101, 1) - 0.01, 1e-6)
     lung = pulmo.DIRECT + pulmo.SCENE + pulmo.LUNG + pulmo.programme("suction 0.3 pressure -20 ramp 0.2")
-    for law in ["birzle"] if lab.small else ["ma", "birzle", "yoshihara", "rausch"]:
+    for law in ["birzle"] if lab.small else ["birzle", "yoshihara", "rausch"]:
         lab.finished(lung + ["-tissue", law], f"lung with springs and airflow, {law}")
+    if not lab.small:
+        run = lab.run(lung + ["-tissue", "ma"])
+        rows, J = run.signals(run.signals_file), ma_soft_in_shear()
+        lab.demand("lung with springs and airflow, ma: least J where it stops, beside that where CM2 loses its shear stiffness",
+                   "it finished" if run.finished else float(rows["min_J"][-1]), f"< {number(J)}", not run.finished and rows["min_J"][-1] < J)
     # the same suction on CM4 with little air: J = 0.7835 everywhere, the porosity 1 - (1 - Phi0)/J changes sign
     J = inflated("yoshihara", -20, 1e-3, 1)
     for porosity, alarm in ((0.3, False), (0.2, True)):
