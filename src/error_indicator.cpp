@@ -230,7 +230,7 @@ PetscErrorCode ErrorIndicator::setup()
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode ErrorIndicator::estimate(Vec local, std::vector<PetscScalar> &tissue, std::vector<PetscScalar> &flow)
+PetscErrorCode ErrorIndicator::estimate(Vec local, CellErrors &errors)
 {
   const bool gas = scene_.facts().airflow;
   const TissueLaw &law = scene_.tissue().law();
@@ -268,27 +268,37 @@ PetscErrorCode ErrorIndicator::estimate(Vec local, std::vector<PetscScalar> &tis
   if (gas) PetscCall(gradient_.fit(gradients, 3));
 
   second.dt = 1;
-  tissue.assign(cells.size(), 0);
-  flow.assign(gas ? cells.size() : 0, 0);
+  PetscReal whole[2] = {0, 0};
+  errors.tissue.assign(cells.size(), 0);
+  errors.flow.assign(gas ? cells.size() : 0, 0);
   for (std::size_t c = 0; c < cells.size(); ++c) {
     const Sampling::Element &e = cells[c];
     const auto &weights = sampling_.weights(e);
     sampling_.sample(e, x.data(), samples);
     for (std::size_t q = 0; q < weights.size(); ++q) {
-      const auto lambda = barycentric(e, samples[q].x);
-      const PetscReal w = weights[q] * e.measure * units::j_per_kPa_mm3;
+      Sample &s = samples[q];
+      const auto lambda = barycentric(e, s.x);
+      const PetscReal w = weights[q] * e.measure * units::j_per_kPa_mm3, w_stress = w / (2 * model_.modulus());
       PetscScalar P[9], error[9];
-      law.stress(samples[q].state, P);
+      law.stress(s.state, P);
       stress_.evaluate(c, lambda.data(), error);
       for (int i = 0; i < 9; ++i) error[i] -= P[i];
-      tissue[c] += w * contract(error, error) / (2 * model_.modulus());
+      whole[0] += w_stress * contract(P, P);
+      errors.tissue[c] += w_stress * contract(error, error);
       if (!gas) continue;
+      const auto dissipation = [&] {
+        const Point point = sampling_.point(s, e, 0, second);
+        return w * scene_.airflow().dissipation()(point, point, constants);
+      };
+      whole[1] += dissipation();
       gradient_.evaluate(c, lambda.data(), error);
-      for (int d = 0; d < 3; ++d) samples[q].grad_p[d] = error[d] - samples[q].grad_p[d];
-      const Point point = sampling_.point(samples[q], e, 0, second);
-      flow[c] += w * scene_.airflow().dissipation()(point, point, constants);
+      for (int d = 0; d < 3; ++d) s.grad_p[d] = error[d] - s.grad_p[d];
+      errors.flow[c] += dissipation();
     }
   }
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, whole, 2, MPIU_REAL, MPIU_SUM, PetscObjectComm((PetscObject)model_.dm())));
+  errors.stress = whole[0];
+  errors.dissipation = whole[1];
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

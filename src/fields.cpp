@@ -16,7 +16,7 @@ namespace {
 /// Edges of a quadratic tetrahedron in the order of VTK and XDMF.
 constexpr std::array<std::array<int, 2>, 6> edges{{{0, 1}, {1, 2}, {0, 2}, {0, 3}, {1, 3}, {2, 3}}};
 
-/// Name of the indicators in the files; that of the flow has more.
+/// Name of the indicators in the files; that of the flow and what they are shares of have more.
 const std::string error_indicator = "error_indicator";
 
 /// Writes a block of values as dataset @p name, @p components per entry.
@@ -244,7 +244,8 @@ PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
   const TissueLaw &law = scene_.tissue().law();
   PetscSection section;
   PetscInt vertex_begin, vertex_end;
-  std::vector<PetscScalar> u, p, J, porosity, hydrostatic, von_mises, tissue_error, flow_error;
+  std::vector<PetscScalar> u, p, J, porosity, hydrostatic, von_mises;
+  CellErrors errors;
   ViewerHandle viewer;
 
   PetscFunctionBeginUser;
@@ -302,7 +303,7 @@ PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
       indicator_ = std::make_unique<ErrorIndicator>(scene_, model_);
       PetscCall(indicator_->setup());
     }
-    PetscCall(indicator_->estimate(local, tissue_error, flow_error));
+    PetscCall(indicator_->estimate(local, errors));
   }
   const std::string name = snapshot_name(count_), file = output_.path(name);
   PetscCall(open_part(comm, file, viewer));
@@ -314,9 +315,15 @@ PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
     PetscCall(write_values(viewer, "pressure", 1, p));
     PetscCall(write_values(viewer, "porosity", 1, porosity));
   }
-  if (output_.error_indicator()) PetscCall(write_values(viewer, error_indicator.c_str(), 1, tissue_error));
-  if (output_.error_indicator() && gas)
-    PetscCall(write_values(viewer, (error_indicator + "_flux").c_str(), 1, flow_error));
+  if (output_.error_indicator()) {
+    PetscMPIInt rank;
+    std::vector<PetscScalar> whole;
+    PetscCallMPI(MPI_Comm_rank(comm, &rank));
+    if (rank == 0) whole = {errors.stress, errors.dissipation};
+    PetscCall(write_values(viewer, error_indicator.c_str(), 1, errors.tissue));
+    if (gas) PetscCall(write_values(viewer, (error_indicator + "_flux").c_str(), 1, errors.flow));
+    PetscCall(write_values(viewer, (error_indicator + "_whole").c_str(), 1, whole));
+  }
   PetscCall(close_whole(comm, file, viewer));
   ++count_;
   snapshots_.push_back({time, name, mesh_, output_.error_indicator()});

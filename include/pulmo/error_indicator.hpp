@@ -8,7 +8,8 @@
 ///   tissue  1/2 int |P* - P'|^2 / M      the energy of the error in stress, J; M: the modulus that scales the model
 ///   flow    int (g* - Grad p) . K (g* - Grad p)     the power that the error in flow dissipates, W; K = k J C^-1
 ///
-/// Both add up over cells; the error in the energy norm is the root of the sum.
+/// Both add up over cells. The root of the sum over that of the same integral of P' (of Grad p) is the relative error
+/// of the stress (of the flow) in that norm.
 #pragma once
 
 #include "pulmo/sampling.hpp"
@@ -59,13 +60,18 @@ private:
   std::vector<PetscScalar> inverses_, coefficients_; ///< [vertex][monomial][monomial], [vertex][component][monomial]
 };
 
-/// The indicators of a scene's states.
+/// The indicators of a state.
+struct CellErrors {
+  std::vector<PetscScalar> tissue, flow; ///< [cell of this rank], J and W (flow: empty without airflow)
+  PetscReal stress = 0, dissipation = 0; ///< of the whole lung: the same integrals of P' and Grad p, J and W
+};
+
+/// Estimates the errors of a scene's states.
 class ErrorIndicator {
 public:
   ErrorIndicator(const Scene &scene, const Model &model) : scene_(scene), model_(model) {}
   PetscErrorCode setup();
-  /// Of each cell of this rank: @p tissue, J; @p flow, W (airflow only, else left empty).
-  PetscErrorCode estimate(Vec local, std::vector<PetscScalar> &tissue, std::vector<PetscScalar> &flow);
+  PetscErrorCode estimate(Vec local, CellErrors &errors);
 
 private:
   const Scene &scene_;
