@@ -23,12 +23,12 @@ namespace pulmo {
 class Recovery {
 public:
   /// Points per cell at which a field is sampled: the centroid of constants, four points of linear fields.
-  enum class Samples { centroid = 1, four = 4 };
+  enum class Samples { centroid, four };
 
-  /// @p sampling must outlive this. Polynomials are of degree 1 for Samples::centroid, 2 for Samples::four; lower at
-  /// vertices whose cells are too few for that.
+  /// Polynomials are of degree 1 for Samples::centroid, 2 for Samples::four; lower at vertices whose cells are too few
+  /// for that.
   PetscErrorCode setup(DM dm, const Sampling &sampling, Samples samples);
-  /// Fits polynomials to @p values, [cell][point of samples()][component].
+  /// Fits polynomials to @p values, [cell][point][component].
   PetscErrorCode fit(const std::vector<PetscScalar> &values, PetscInt components);
   /// The recovered field at the point of cell @p c with barycentric coordinates @p lambda, after fit().
   void evaluate(std::size_t c, const PetscReal lambda[4], PetscScalar value[]) const;
