@@ -9,8 +9,7 @@ namespace pulmo {
 
 namespace {
 
-constexpr double j_per_kPa_mm3 = 1e-6;
-constexpr double j_per_cmH2O_ml = units::kPa_per_cmH2O * units::mm3_per_ml * j_per_kPa_mm3;
+constexpr double j_per_cmH2O_ml = units::kPa_per_cmH2O * units::mm3_per_ml * units::j_per_kPa_mm3;
 
 /// The rows of the balance that every run lists, in this order.
 const EnergyAccount usual_accounts[] = {
@@ -164,7 +163,7 @@ PetscErrorCode EnergyAudit::observe(const StepReport &step)
     PetscCall(add_support_work(step, sums[account("external", Energy::external)]));
     PetscCallMPI(
         MPI_Allreduce(MPI_IN_PLACE, sums.data(), static_cast<PetscMPIInt>(sums.size()), MPI_DOUBLE, MPI_SUM, comm));
-    for (double &sum : sums) sum *= j_per_kPa_mm3;
+    for (double &sum : sums) sum *= units::j_per_kPa_mm3;
     const double volume = row.flow * row.dt, work = row.machine_pressure() * volume * j_per_cmH2O_ml;
     sums[account("resistive_tube", Energy::dissipated)] +=
         (row.machine_pressure() - row.pressure) * volume * j_per_cmH2O_ml;

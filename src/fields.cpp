@@ -1,4 +1,5 @@
 // Field snapshots: HDF5 through PETSc's viewer, one XDMF index with quadratic tetrahedra.
+#include "pulmo/error_indicator.hpp"
 #include "pulmo/node_order.hpp"
 #include "pulmo/output.hpp"
 
@@ -14,6 +15,9 @@ namespace {
 
 /// Edges of a quadratic tetrahedron in the order of VTK and XDMF.
 constexpr std::array<std::array<int, 2>, 6> edges{{{0, 1}, {1, 2}, {0, 2}, {0, 3}, {1, 3}, {2, 3}}};
+
+/// Name of the indicators in the files; that of the flow and what they are shares of have more.
+const std::string error_indicator = "error_indicator";
 
 /// Writes a block of values as dataset @p name, @p components per entry.
 PetscErrorCode write_values(PetscViewer viewer, const char *name, PetscInt components,
@@ -68,6 +72,12 @@ std::string snapshot_name(PetscInt index, const char *what = "")
 
 } // namespace
 
+FieldWriter::FieldWriter(const Output &output, const Scene &scene, Model &model)
+    : output_(output), scene_(scene), model_(model), schedule_(output.fields_every(), true)
+{}
+
+FieldWriter::~FieldWriter() = default;
+
 PetscErrorCode FieldWriter::observe(const StepReport &step)
 {
   const bool start = step.row.dt == 0;
@@ -83,14 +93,19 @@ PetscErrorCode FieldWriter::persist(Archive &archive, Vec)
   std::string names;
 
   PetscFunctionBeginUser;
-  for (const Snapshot &s : snapshots_) names += s.file + " " + s.mesh + "\n";
+  for (const Snapshot &s : snapshots_)
+    names += s.file + " " + s.mesh + (s.error_indicator ? " " + error_indicator : "") + "\n";
   PetscCall(archive.text("fields/files", names));
   PetscCall(archive.table("fields/times_s", snapshots_, Snapshot(), [](Snapshot &s, Cells &cells) { cells(s.time); }));
   PetscCall(archive.value("fields/count", count_));
   if (archive.reading()) {
     std::istringstream lines(names);
     for (Snapshot &s : snapshots_) {
-      lines >> s.file >> s.mesh;
+      std::string line, more;
+      std::getline(lines, line);
+      std::istringstream words(line);
+      words >> s.file >> s.mesh >> more;
+      s.error_indicator = more == error_indicator;
       const bool plain = s.file.rfind("fields", 0) == 0 && s.mesh.rfind("fields", 0) == 0 &&
                          (s.file + s.mesh).find('/') == std::string::npos;
       PetscCall(archive.check(plain, "fields/files"));
@@ -230,6 +245,7 @@ PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
   PetscSection section;
   PetscInt vertex_begin, vertex_end;
   std::vector<PetscScalar> u, p, J, porosity, hydrostatic, von_mises;
+  CellErrors errors;
   ViewerHandle viewer;
 
   PetscFunctionBeginUser;
@@ -282,6 +298,13 @@ PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
     von_mises.push_back(mean_m);
     if (gas) porosity.push_back(1 - (1 - scene_.airflow().porosity()) / mean_J);
   }
+  if (output_.error_indicator()) {
+    if (!indicator_) {
+      indicator_ = std::make_unique<ErrorIndicator>(scene_, model_);
+      PetscCall(indicator_->setup());
+    }
+    PetscCall(indicator_->estimate(local, errors));
+  }
   const std::string name = snapshot_name(count_), file = output_.path(name);
   PetscCall(open_part(comm, file, viewer));
   PetscCall(write_values(viewer, "displacement", 3, u));
@@ -292,9 +315,18 @@ PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
     PetscCall(write_values(viewer, "pressure", 1, p));
     PetscCall(write_values(viewer, "porosity", 1, porosity));
   }
+  if (output_.error_indicator()) {
+    PetscMPIInt rank;
+    std::vector<PetscScalar> whole;
+    PetscCallMPI(MPI_Comm_rank(comm, &rank));
+    if (rank == 0) whole = {errors.stress, errors.dissipation};
+    PetscCall(write_values(viewer, error_indicator.c_str(), 1, errors.tissue));
+    if (gas) PetscCall(write_values(viewer, (error_indicator + "_flux").c_str(), 1, errors.flow));
+    PetscCall(write_values(viewer, (error_indicator + "_whole").c_str(), 1, whole));
+  }
   PetscCall(close_whole(comm, file, viewer));
   ++count_;
-  snapshots_.push_back({time, name, mesh_});
+  snapshots_.push_back({time, name, mesh_, output_.error_indicator()});
   PetscCall(write_index());
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -340,6 +372,9 @@ PetscErrorCode FieldWriter::write_index() const
         attribute("pressure", "Node", n_nodes_, 1);
         attribute("porosity", "Cell", n_cells_, 1);
       }
+      if (s.error_indicator) attribute(error_indicator.c_str(), "Cell", n_cells_, 1);
+      if (s.error_indicator && scene_.facts().airflow)
+        attribute((error_indicator + "_flux").c_str(), "Cell", n_cells_, 1);
       f << " </Grid>\n";
     }
     f << "</Grid>\n</Domain>\n</Xdmf>\n";

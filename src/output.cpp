@@ -42,6 +42,8 @@ PetscErrorCode Output::declare(Options &options)
   PetscCall(options.real("fields_every", "s", Range::not_negative(),
                          "interval of field snapshots, at the first step at or after (0: at the end of each phase)",
                          fields_every_));
+  PetscCall(options.flag("fields_error_indicator", "write what each cell adds to the error in space (docs/accuracy)",
+                         error_indicator_));
   options.group("progress", "progress");
   PetscCall(options.flag("", "one line a step", progress_));
   PetscFunctionReturn(PETSC_SUCCESS);

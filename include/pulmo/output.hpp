@@ -12,6 +12,8 @@
 
 namespace pulmo {
 
+class ErrorIndicator;
+
 /// Gives @p file, which rank 0 wrote through @p f under its name and ".part", its own name; a user error on all ranks
 /// if that or the writing failed.
 PetscErrorCode finish_file(MPI_Comm comm, std::ofstream &f, const std::string &file);
@@ -29,10 +31,12 @@ public:
   const std::string &directory() const { return directory_; }
   bool progress() const { return progress_; }
   PetscReal fields_every() const { return fields_every_; } ///< s; 0: at phase ends
+  /// Whether snapshots hold the indicators of pulmo/error_indicator.hpp.
+  bool error_indicator() const { return error_indicator_; }
 
 private:
   std::string directory_ = "results";
-  bool overwrite_ = false, progress_ = true;
+  bool overwrite_ = false, progress_ = true, error_indicator_ = false;
   PetscReal fields_every_ = 0;
 };
 
@@ -83,9 +87,8 @@ private:
 /// Writes the mesh once and a snapshot of the fields at phase ends or at intervals; P2 stays quadratic.
 class FieldWriter final : public Observer {
 public:
-  FieldWriter(const Output &output, const Scene &scene, Model &model)
-      : output_(output), scene_(scene), model_(model), schedule_(output.fields_every(), true)
-  {}
+  FieldWriter(const Output &output, const Scene &scene, Model &model);
+  ~FieldWriter() override;
   PetscErrorCode observe(const StepReport &step) override;
   /// The snapshots so far.
   PetscErrorCode persist(Archive &archive, Vec local) override;
@@ -105,6 +108,7 @@ private:
   struct Snapshot {
     PetscReal time;         ///< s
     std::string file, mesh; ///< in the output directory
+    bool error_indicator;   ///< whether it has one
   };
 
   const Output &output_;
@@ -118,6 +122,7 @@ private:
   std::string mesh_ = "fields.h5"; ///< nodes and cells of this session's snapshots
   bool mesh_written_ = false;
   Schedule schedule_;
+  std::unique_ptr<ErrorIndicator> indicator_; ///< made for the first snapshot that wants one
 };
 
 /// What a run was watched by, and what is known of its errors.

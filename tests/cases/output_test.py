@@ -431,6 +431,58 @@ class OtherScenes(unittest.TestCase):
         self.assertEqual(case.json()["options"]["-output_dir"], case.directory)
 
 
+class ErrorIndicator(unittest.TestCase):
+    """-output_fields_error_indicator; against true errors: tests/unit/error_indicator_test.cpp, tests/verification/mms."""
+
+    SHORT = pulmo.TIGHT + pulmo.PCV + pulmo.CUBE + ["-ts_max_time", "0.2", "-output_fields_error_indicator"]
+    NAMES = ["error_indicator", "error_indicator_flux"]
+
+    def test_any_number_of_ranks(self):
+        def by_place(case):
+            points, cells, steps = read_fields(case)
+            order = np.lexsort(np.round(points[cells[:, :4]].mean(axis=1), 6).T)
+            return [steps[-1][2][name][order] for name in self.NAMES]
+
+        one = by_place(pulmo.finished(self.SHORT))
+        for ranks in (2, 3):
+            for name, a, b in zip(self.NAMES, one, by_place(pulmo.finished(self.SHORT, ranks=ranks))):
+                self.assertEqual(a.shape, (100,))
+                self.assertGreater(a.min(), 0)
+                np.testing.assert_allclose(a, b, rtol=1e-6, err_msg=f"{name}, {ranks} ranks")
+
+    def test_without_airflow(self):
+        _, _, steps = read_fields(pulmo.finished(self.SHORT + pulmo.STILL))
+        self.assertEqual(set(steps[0][2]), {"J", "hydrostatic_stress", "von_mises_stress", "error_indicator"})
+        self.assertEqual(np.abs(steps[0][2]["error_indicator"]).max(), 0, "at rest")
+        self.assertGreater(steps[-1][2]["error_indicator"].min(), 0)
+
+    def test_earlier_snapshots_keep_what_they_have(self):
+        """The option may come with a restart; fields.xdmf names what each file holds."""
+        plain = [o for o in self.SHORT if o != "-output_fields_error_indicator"]
+        case = pulmo.finished(plain + ["-checkpoint_every", "0.1", "-output_fields_every", "0.1"])
+        pulmo.finished(self.SHORT + ["-ts_max_time", "0.3", "-output_fields_every", "0.1", "-restart", case.path("checkpoint.h5"),
+                                     "-output_overwrite"], directory=case.directory)
+        _, _, steps = read_fields(case)
+        self.assertEqual(["error_indicator" in cellwise for _, _, cellwise in steps], [False, False, False, True])
+
+    def test_large_at_the_rim_of_the_airway(self):
+        case = pulmo.finished(pulmo.options_file("solvers/iterative.opts") + pulmo.PCV + pulmo.LUNG + [
+            "-ts_max_time", "0.1", "-output_fields_error_indicator"])
+        mesh = meshio.read(pulmo.mesh("lung_test.msh"))
+        points, cells, steps = read_fields(case)
+        corners = points[cells[:, :4]]
+        volume = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6
+        nodes = [set(mesh.cells_dict["triangle"][mesh.cell_data_dict["gmsh:physical"]["triangle"] == tag].ravel())
+                 for tag in (mesh.field_data["airway"][0], mesh.field_data["pleura"][0])]
+        rim = mesh.points[sorted(nodes[0] & nodes[1])]
+        self.assertGreater(len(rim), 5)
+        at_rim = (np.abs(corners[:, :, None] - rim).max(axis=-1) < 1e-6).any(axis=(1, 2))
+        self.assertLess(at_rim.sum(), 0.1 * len(cells))
+        for name, times in zip(self.NAMES, (5, 30)):
+            density = steps[-1][2][name] / volume
+            self.assertGreater(np.median(density[at_rim]), times * np.median(density[~at_rim]), name)
+
+
 class Help(unittest.TestCase):
     # contract: option and unit (None: none of its own)
     OPTIONS = {
@@ -447,7 +499,7 @@ class Help(unittest.TestCase):
         "-ventilator_breaths": "-", "-lumen_pressure": "on/off", "-lumen_pressure_surfaces": None, "-support": "on/off",
         "-support_rigid": "on/off", "-support_surfaces": None, "-traction": "on/off", "-traction_surfaces": None,
         "-traction_value": "kPa", "-quadrature_degree": "-", "-output_dir": "text", "-output_overwrite": "on/off",
-        "-output_fields_every": "s", "-progress": "on/off", "-effects_view": "on/off", "-energy_audit": "on/off"}
+        "-output_fields_every": "s", "-output_fields_error_indicator": "on/off", "-progress": "on/off", "-effects_view": "on/off", "-energy_audit": "on/off"}
 
     def test_every_option_with_its_unit(self):
         case = pulmo.finished(["-help"])

@@ -26,6 +26,10 @@ def benchmark(*arguments):
     return tool("benchmark", "--build", os.path.dirname(pulmo.PROGRAM), *arguments)
 
 
+def tet_volumes(x, cells):
+    return np.abs(np.linalg.det(x[cells[:, 1:4]] - x[cells[:, :1]])) / 6
+
+
 def table(path):
     with open(path, newline="") as f:
         return list(csv.DictReader(f))
@@ -41,6 +45,34 @@ class Tools(unittest.TestCase):
         self.assertAlmostEqual(summary["reference_volume_ml"], 900, delta=0.1)
         self.assertEqual(sorted(summary["surface_areas_mm2"]), ["airway", "pleura"])
         self.assertGreater(case.signals()["volume_ml"][-1], 0)
+
+    def test_lung_mesh_follows_the_error_indicator(self):
+        """On as many tetrahedra as before the cells with most error get smaller, the others larger."""
+        lung = ["--side", "right", "--volume", "1350", "--bronchus-radius", "7"]  # that of lung_test.msh
+        case = pulmo.finished(pulmo.options_file("solvers/iterative.opts") + pulmo.PCV + pulmo.LUNG + [
+            "-ts_max_time", "0.1", "-output_fields_error_indicator"])
+        mesh = pulmo.scratch("adapted.msh")
+        made = tool("lung_mesh", *lung, "--size-field", case.path("fields.xdmf"), "--output", mesh)
+        self.assertEqual(made.returncode, 0, made.stderr)
+        adapted = pulmo.finished(pulmo.DIRECT + pulmo.PCV + ["-dm_plex_filename", mesh, "-ts_max_time", "0.05"])
+        self.assertAlmostEqual(adapted.json()["cells"] / case.json()["cells"], 1, delta=0.1)
+        self.assertAlmostEqual(adapted.json()["reference_volume_ml"], 1350, delta=0.1)
+        x, cells, values = pulmo.fields(case)
+        centres, volume = x[cells[:, :4]].mean(axis=1), tet_volumes(x, cells)
+        x, cells, _ = pulmo.fields(adapted)
+        nearest = np.linalg.norm(centres[:, None] - x[cells[:, :4]].mean(axis=1), axis=2).argmin(axis=1)
+        change = tet_volumes(x, cells)[nearest] / volume
+        error = values["error_indicator_flux"] / volume
+        self.assertLess(np.median(change[error > np.quantile(error, 0.9)]), 0.8)
+        self.assertGreater(np.median(change[error < np.quantile(error, 0.5)]), 1)
+
+    def test_lung_mesh_refuses_a_size_field(self):
+        case = pulmo.finished(pulmo.DIRECT + pulmo.PCV + pulmo.CUBE + ["-ts_max_time", "0.05"])
+        for path, word in ((case.path("fields.xdmf"), "-output_fields_error_indicator"), ("none.xdmf", "fields.xdmf")):
+            made = tool("lung_mesh", "--size-field", path, "--output", pulmo.scratch("none.msh"))
+            self.assertEqual(made.returncode, 1)
+            self.assertIn(word, made.stderr)
+            self.assertNotIn("Traceback", made.stderr)
 
     def test_lung_mesh_refuses(self):
         made = tool("lung_mesh", "--side", "left", "--volume", "-3", "--output", pulmo.scratch("none.msh"))

@@ -251,8 +251,8 @@ TEST(PMultigrid, SinglePrecisionPreconditionsAsDouble)
     EXPECT_LT(difference, 1e-5) << hold;
     if (hold == springs)
       EXPECT_GT(difference, 1e-10) << "nothing was rounded";
-    else
-      EXPECT_EQ(difference, 0) << hold;
+    else // on several ranks MUMPS adds in the order in which messages come
+      EXPECT_LT(difference, 1e-13) << hold;
     PULMO_OK(VecScale(x[3], 2));
     EXPECT_LT(relative_difference(x[1], x[3]), 1e-5) << "after new values: " << hold;
   }

@@ -116,6 +116,8 @@ public:
   const char *about() const override { return "Darcy flow of alveolar air (mass balance, pressure field)"; }
   bool active() const override { return on_; }
   PetscReal porosity() const { return porosity_; }
+  /// Heat of the flow in a step, by point: quadratic in Grad p, kPa.
+  EnergyDensity dissipation() const { return laws_[chosen_]->dissipation_callback(); }
 
   PetscErrorCode declare(Options &options) override
   {
@@ -181,7 +183,7 @@ public:
                nullptr, nullptr);
     c.jacobian("flux", pressure, displacement, nullptr, nullptr, nullptr, darcy.flux_by_displacement_callback());
     c.jacobian("flux", pressure, pressure, nullptr, nullptr, nullptr, darcy.flux_by_pressure_callback());
-    c.energy(Energy::dissipated, "resistive", "", darcy.dissipation_callback());
+    c.energy(Energy::dissipated, "resistive", "", dissipation());
     c.energy(Energy::numerical, "numerical_dissipation", "", energy_density<P, numerical_gas_loss>);
     for (const std::string &surface : surfaces_) {
       Constraint open;

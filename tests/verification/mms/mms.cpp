@@ -9,6 +9,7 @@
 //     z0                    traction   essential P N
 //     z1             z essential, else   flux    P N, Q.N
 //                           traction
+#include "pulmo/error_indicator.hpp"
 #include "support/scene.hpp"
 #include "verification/mms/sources.hpp"
 #include "verification/support/fields.hpp"
@@ -101,14 +102,22 @@ std::string options(const char *law, const std::string &mesh, double dt, bool we
 
 struct Errors {
   double u = 0, grad_u = 0, p = 0, grad_p = 0; ///< L2 over the reference volume
+  double tissue = 0, flow = 0;                 ///< in the norms of the error indicators, their estimates
+  double estimated_tissue = 0, estimated_flow = 0;
 };
 
 template <class Solution>
-PetscErrorCode errors(DM dm, Vec local, double t, Errors &e)
+PetscErrorCode errors(pulmo::Run &run, Vec local, double t, Errors &e)
 {
+  const DM dm = run.model().dm();
+  const TissueLaw &law = run.scene().tissue().law();
+  constexpr double J = 1e-6; // per kPa mm^3
+  ErrorIndicator indicator(run.scene(), run.model());
+  CellErrors estimate;
+
   PetscFunctionBeginUser;
   e = Errors();
-  PetscCall(sample_rule(dm, local, 6, [&](const Sample &s) {
+  PetscCall(sample_rule(dm, local, 6, [&](const pulmo::test::Sample &s) {
     double u[3], grad_u[9], p, grad_p[3];
     mms::values<Solution>(t, s.x, u, grad_u, p, grad_p);
     const auto square = [](double v) { return v * v; };
@@ -116,8 +125,26 @@ PetscErrorCode errors(DM dm, Vec local, double t, Errors &e)
     for (int i = 0; i < 9; ++i) e.grad_u += s.weight * square(s.grad_u[i] - grad_u[i]);
     e.p += s.weight * square(s.p - p);
     for (int i = 0; i < 3; ++i) e.grad_p += s.weight * square(s.grad_p[i] - grad_p[i]);
+    PointState exact, computed;
+    PetscScalar P[9], P_h[9];
+    make_point_state(grad_u, nullptr, exact);
+    make_point_state(s.grad_u, nullptr, computed);
+    law.stress(exact, P);
+    law.stress(computed, P_h);
+    for (int i = 0; i < 9; ++i) e.tissue += J * s.weight * square(P[i] - P_h[i]) / (2 * run.model().modulus());
+    const double k = RationalPermeability::permeability(computed.J, {}).k;
+    for (int i = 0; i < 3; ++i) {
+      double flux = 0;
+      for (int j = 0; j < 3; ++j) flux += computed.cof_F[3 * i + j] * (grad_p[j] - s.grad_p[j]);
+      e.flow += J * s.weight * k / computed.J * square(flux);
+    }
   }));
-  for (double *v : {&e.u, &e.grad_u, &e.p, &e.grad_p}) *v = std::sqrt(*v);
+  PetscCall(indicator.setup());
+  PetscCall(indicator.estimate(local, estimate));
+  for (double v : estimate.tissue) e.estimated_tissue += v;
+  for (double v : estimate.flow) e.estimated_flow += v;
+  for (double *v : {&e.u, &e.grad_u, &e.p, &e.grad_p, &e.tissue, &e.flow, &e.estimated_tissue, &e.estimated_flow})
+    *v = std::sqrt(*v);
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -293,7 +320,7 @@ void convergence(std::vector<Errors> &e)
     ASSERT_TRUE(finished) << run.simulation().failure_text();
     ASSERT_NEAR(run.simulation().time(), 1, 1e-9);
     e.emplace_back();
-    PULMO_OK(errors<Solution>(run.model().dm(), run.simulation().local_state(), 1, e.back()));
+    PULMO_OK(errors<Solution>(run, run.simulation().local_state(), 1, e.back()));
     std::printf("  %-9s %-11s J %.2f..%.2f  u %.3e  Grad u %.3e  p %.3e  Grad p %.3e", Law::name, mesh.c_str(),
                 run.simulation().rows().back().min_J, run.simulation().rows().back().max_J, e.back().u, e.back().grad_u,
                 e.back().p, e.back().grad_p);
@@ -302,10 +329,16 @@ void convergence(std::vector<Errors> &e)
       std::printf("  orders %.2f %.2f %.2f %.2f", order(c.u, f.u), order(c.grad_u, f.grad_u), order(c.p, f.p),
                   order(c.grad_p, f.grad_p));
     }
-    std::printf("\n");
+    std::printf("  effectivity of the indicators %.3f %.3f\n", e.back().estimated_tissue / e.back().tissue,
+                e.back().estimated_flow / e.back().flow);
   }
   EXPECT_GT(e.back().u, 1e-8) << "an error of nothing means that nothing was tested";
   EXPECT_GT(e.back().p, 1e-8);
+  // stress: what the error of p makes of u is smooth and partly missed
+  EXPECT_GT(e.back().estimated_tissue, 0.6 * e.back().tissue);
+  EXPECT_LT(e.back().estimated_tissue, 1.1 * e.back().tissue);
+  EXPECT_GT(e.back().estimated_flow, 0.75 * e.back().flow);
+  EXPECT_LT(e.back().estimated_flow, 1.9 * e.back().flow);
 }
 
 // (a) Neither field is in its space: Grad u and p have order 2, Grad p has order 1. In L2 u has order 2 too: the error
@@ -484,7 +517,7 @@ TYPED_TEST(ManufacturedRun, OrderInTime)
       ASSERT_TRUE(finished) << run.simulation().failure_text();
       ASSERT_EQ(run.simulation().rows().size(), static_cast<std::size_t>(steps + 1)); // no step was cut
       e.emplace_back();
-      PULMO_OK(errors<Solution>(run.model().dm(), run.simulation().local_state(), 1, e.back()));
+      PULMO_OK(errors<Solution>(run, run.simulation().local_state(), 1, e.back()));
       std::printf("  %s, %-9s dt 1/%-3d J %.2f..%.2f  u %.3e  p %.3e", integrator.name, Law::name, steps,
                   run.simulation().rows().back().min_J, run.simulation().rows().back().max_J, e.back().u, e.back().p);
       if (e.size() > 1)
