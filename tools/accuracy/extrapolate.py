@@ -58,12 +58,12 @@ def fitted(sizes, values, order):
 
 
 def three(sizes, values, formal):
-    """Limit and order from three levels with an order not above the formal one; None if they tell no order of at least half
-    of it (at least 0.4)."""
+    """Observed order, and limits with it and with the formal one; None if the levels tell no order of at least half of that
+    (at least 0.4)."""
     p = observed_order(sizes, values)
     if p is None or p < min(0.4, formal / 2):
         return None
-    return pair(sizes[1:], values[1:], min(p, formal)), p
+    return p, pair(sizes[1:], values[1:], p), pair(sizes[1:], values[1:], formal)
 
 
 def limit(sizes, values, formal):
@@ -81,10 +81,10 @@ def limit(sizes, values, formal):
         return Limit(value, 2 * abs(value - fine), None, 2, f"two levels, order {formal} assumed")
     found = three(sizes[-3:], values[-3:], formal)
     if found:
-        value, p = found
-        others = [pair(sizes[-2:], values[-2:], formal)]
+        p, *others = found
+        value = others[0] if p <= formal else others[1]
         if len(values) > 3 and (before := three(sizes[-4:-1], values[-4:-1], formal)):
-            others.append(before[0])
+            others.append(before[1] if before[0] <= formal else before[2])
         spread = max([(0.25 if p <= 1.5 * formal else 2) * abs(value - fine), *(abs(value - other) for other in others)])
         return Limit(value, max(spread, scale), p, 3, f"order {p:.2f} observed" + (f", {formal} used" if p > formal else ""))
     used = min(4, len(values))

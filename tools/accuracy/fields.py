@@ -142,7 +142,7 @@ class Comparison:
         if key not in self.places:
             locator = Locator(fields.points, fields.cells)
             cells, bary, inside = locator(self.x)
-            self.places[key] = (cells, bary, locator.slopes, 1 - float(self.weights @ inside / self.weights.sum()))
+            self.places[key] = (cells, bary, locator.slopes, float(self.weights @ ~inside / self.weights.sum()))
         return self.places[key]
 
     def __call__(self, fields):

@@ -113,7 +113,7 @@ class Ladder:
         for repeat in range(self.options.repeat):
             # a loaded machine's wall time may be several times the CPU time that is counted
             longest = max(1.0, self.left()) * (1 if self.options.clock == "wall" else 4)
-            result = runs.measured([*self.command(setting), "-output_dir"], self.options.output / "runs", repeat,
+            result = runs.measured([*self.command(setting), "-output_dir"], self.options.results / "runs", repeat,
                                    self.options.ranks, longest)
             self.new += not result["kept"]
             self.spent += result[self.options.clock]

@@ -1,4 +1,6 @@
 """What a run is set to: mesh, steps in time, solver; and the ladder of each."""
+import contextlib
+import io
 import json
 import re
 import resource
@@ -88,7 +90,8 @@ def plain_options(path):
 
 def cells_of(path):
     """Tetrahedra of a mesh file."""
-    return sum(len(block.data) for block in meshio.read(path).cells if block.type == "tetra")
+    with contextlib.redirect_stdout(io.StringIO()):  # meshio prints empty lines
+        return sum(len(block.data) for block in meshio.read(path).cells if block.type == "tetra")
 
 
 def lung(size, folder, clock):
@@ -114,7 +117,7 @@ def meshes(options, scene):
     given, seconds = list(options.meshes or []), 0
     own = of_files(scene, "-dm_plex_filename")
     if options.lung or not (given or own):
-        made = [lung(size, options.output / "meshes", options.clock) for size in sorted(options.lung or [30, 21, 15], reverse=True)]
+        made = [lung(size, options.results / "meshes", options.clock) for size in sorted(options.lung or [30, 21, 15], reverse=True)]
         given, seconds = [path for path, _ in made], sum(s for _, s in made)
     ladder = []
     for path in given or [Path(own)]:
