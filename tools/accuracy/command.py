@@ -98,8 +98,8 @@ def axes(options, scene):
     return Axes(meshes, steps, solvers, settings.Setting(meshes[0], first, solvers[0])), spent
 
 
-def explore(words):
-    """Makes the runs that the words of a command ask for and writes its folder; the search and its sentences."""
+def prepare(words):
+    """The search that the words of a command ask for; no run is made."""
     options = parse(words)
     require(options.build, [])
     scene = [word for name in options.scene for word in ("-options_file", str(scene_file(name)))]
@@ -107,14 +107,21 @@ def explore(words):
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("tools/accuracy_cost: ended; finished runs are kept"))
     keys = list(options.asked) or [ALIASES.get(name, name) for name in options.numbers]
     ladder = Ladder(found, scene, options.flags, options, spent)
-    search = Search(ladder, keys, options.asked, LEVELS)
+    return Search(ladder, keys, options.asked, LEVELS)
+
+
+def explore(words):
+    """Makes the runs that the words of a command ask for and writes its folder; the search and its sentences."""
+    search = prepare(words)
+    ladder = search.ladder
     try:
         search.explore()
     except KeyboardInterrupt:
         sys.exit("tools/accuracy_cost: interrupted; finished runs are kept")
-    unknown = [short(k) for k in options.asked if ladder.done and k not in ladder.done[found.base].numbers]
+    base = ladder.done.get(search.axes.base)
+    unknown = [short(k) for k in search.asked if base and k not in base.numbers]
     if unknown:
-        fail(f"the scene has no {', '.join(unknown)}; it has {', '.join(map(short, ladder.done[found.base].numbers))}")
+        fail(f"the scene has no {', '.join(unknown)}; it has {', '.join(map(short, base.numbers))}")
     sentences = page.write(search, page.command_line(words))
     print("\n".join(sentences))
     print(f"{len(ladder.done) + len(ladder.failed)} runs, {ladder.new} of them new; {len(ladder.failed)} failed, {len(ladder.skipped)} left out")

@@ -70,17 +70,17 @@ class Errors:
 
 
 def in_time(values, axes):
-    """Limit in time on the base's mesh and which scheme gave it: the surest one; schemes that differ by more than both
-    doubts widen it."""
+    """Limits in time of each scheme on the base's mesh, and the surest of them; schemes that differ by more than both doubts
+    widen it, unless only one shows an order: where the other still wanders its limit says nothing."""
     limits = {}
     for scheme in ORDERS:
         ladder = sorted(((t.dt, values[s]) for t in axes.steps if t.scheme == scheme and not t.tolerance
                          if (s := Setting(axes.base.mesh, t, axes.base.solver)) in values), reverse=True)
         if ladder:
             limits[scheme] = limit(*zip(*ladder), ORDERS[scheme])
-    best = min(limits, key=lambda scheme: limits[scheme].uncertainty)
-    chosen = limits[best]
-    for other in limits.values():
+    converging = [found for found in limits.values() if found.order is not None]
+    chosen = min(converging or limits.values(), key=lambda found: found.uncertainty)
+    for other in converging or limits.values():
         apart = abs(other.value - chosen.value)
         if apart > other.uncertainty + chosen.uncertainty:
             chosen = Limit(chosen.value, apart, chosen.order, chosen.levels, chosen.how + "; the schemes' limits differ")

@@ -89,4 +89,6 @@ def limit(sizes, values, formal):
         return Limit(value, max(spread, scale), p, 3, f"order {p:.2f} observed" + (f", {formal} used" if p > formal else ""))
     used = min(4, len(values))
     value, scatter = fitted(sizes[-used:], values[-used:], formal)
-    return Limit(value, max(2 * abs(value - fine) + 2 * scatter, scale), None, used, f"no order seen, {formal} fitted")
+    last = abs(values[-1] - values[-2])
+    growing = last if last > abs(values[-2] - values[-3]) else 0  # not yet where it converges
+    return Limit(value, max(2 * abs(value - fine) + 2 * scatter + growing, scale), None, used, f"no order seen, {formal} fitted")

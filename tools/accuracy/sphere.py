@@ -146,12 +146,13 @@ def factors(search, tolerances=(0.01, 0.001)):
     return header, table
 
 
-def run(folder, results):
+def run(folder, results, build):
     """Makes the runs, and writes the tool's page, truth.md, tables and a figure to the folder."""
     numbers = truth.numbers()
     paths = meshes(results / "meshes")
     search, _ = command.explore(["hollow_sphere", "--meshes", *map(str, paths), "--budget", "6min", "--clock", "cpu", "--solvers", "iterative",
-                                 "--numbers", *(a for a in ALIASES if a != "PIP"), "--output", str(folder), "--results", str(results), "--", *ROLLERS])
+                                 "--numbers", *(a for a in ALIASES if a != "PIP"), "--output", str(folder), "--results", str(results), *build,
+                                 "--", *ROLLERS])
     base = search.axes.base
     for scheme in SCHEMES:  # the table's middle mesh, as far as dt 0.025
         for dt in STEPS[:4]:
