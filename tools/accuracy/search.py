@@ -4,9 +4,11 @@ from dataclasses import dataclass
 
 from .errors import estimate
 from .numbers import percent, short
+from .settings import ORDERS
 
 SPACE = 1 / 4     # a mesh comes before steps that cost as much: there are fewer, and fewer than three tell little
 SINGLES = 2 / 3   # share of the budget that the ladders alone may take before joint runs had their turn
+EVIDENCE = 3      # levels that a limit has to stand on for a question to be answered, where the ladder has as many
 LIKE = 8          # joint settings whose single errors differ by more than this factor waste the smaller one
 
 
@@ -79,10 +81,17 @@ class Search:
                and not (s in self.ladder.done and self.worst(self.ladder.done[s], demand) > 1)]
         return min(met, key=self.cost, default=None)
 
+    def enough(self):
+        """Whether all limits stand on three levels, or on all that there are: two show no order."""
+        a = self.axes
+        least = {"space": min(EVIDENCE, len(a.meshes)),
+                 "time": min(EVIDENCE, max(sum(t.scheme == s and not t.tolerance for t in a.steps) for s in ORDERS))}
+        return all(e.limits[name].levels >= n for e in self.errors().values() for name, n in least.items())
+
     def known(self):
         """Whether a question has its answer: a run meets it and nothing that is cheaper promises to."""
         run, best = self.cheapest_run(self.demands()[0]), self.promising(self.demands()[0])
-        return run is not None and (best is None or self.cost(best) >= self.ladder.seconds(run))
+        return run is not None and self.enough() and (best is None or self.cost(best) >= self.ladder.seconds(run))
 
     def answers(self):
         found = []
@@ -149,7 +158,7 @@ class Search:
         demand = self.demands()[0]
         while not self.known():
             best = self.promising(demand)
-            if best and best not in self.ladder.done and self.ladder.fits(best):
+            if best and self.enough() and best not in self.ladder.done and self.ladder.fits(best):
                 self.ladder.attempt(best)
                 continue
             rest = [s for s in self.untried(self.useful()) if self.ladder.fits(s)]
@@ -158,17 +167,20 @@ class Search:
             self.ladder.attempt(rest[0])
 
     def useful(self):
-        """Single runs that can still bring an answer: all ladders until three levels are known, then those whose limit is in
-        doubt or which lack a level that is good enough."""
+        """Single runs that can still bring an answer: of ladders whose limit stands on less than three levels or is in doubt,
+        or which lack a level that is good enough."""
         base, demand = self.axes.base, self.demands()[0]
         errors, found = self.errors(), []
         for setting in self.axes.singles():
-            name = ("space" if setting.mesh != base.mesh else "time" if setting.steps != base.steps else "solver")
+            name = "space" if setting.mesh != base.mesh else "time" if setting.steps != base.steps else "solver"
             ladder = {"space": self.axes.meshes, "time": self.axes.steps, "solver": self.axes.solvers}[name]
             for key, share in demand.items():
                 if key not in errors:
                     continue
                 e = errors[key]
+                if name != "solver" and e.limits[name].levels < EVIDENCE:
+                    found.append(setting)
+                    break
                 good = min((abs(e.parts[part] / e.value) for part in ladder if part in e.parts), default=math.inf)
                 if e.shares[name] > 0.15 * share * abs(e.value) or good > 0.4 * share or e.shares["coupling"] > 0.2 * share * abs(e.value):
                     found.append(setting)
