@@ -133,9 +133,9 @@ class Searching(unittest.TestCase):
         cells = {f"{n}.msh": n for n in (1000, 2500, 6000, 15000)}
         options = argparse.Namespace(budget=budget, clock="wall", repeat=1, ranks=1, build=pathlib.Path("build"), output=pathlib.Path("nowhere"),
                                      results=pathlib.Path("nowhere"), schemes=["beuler", "bdf"], dt_factors=[4, 2, 1, 0.5, 0.25, 0.125],
-                                     adaptive=0, solvers=["iterative"])
+                                     adaptive=0, solvers=["iterative"], tolerances=[])
         meshes = [settings.Mesh(name, ("-dm_plex_filename", name), n) for name, n in cells.items()]
-        steps, solvers = settings.steps(options, 0.05), settings.solvers(options)[:1]
+        steps, solvers = settings.steps(options, 0.05), settings.solvers(options)
         base = settings.Setting(meshes[0], next(t for t in steps if t.dt == 0.05), solvers[0])
         known = Known(cells, fails)
         with mock.patch.object(ladder.runs, "measured", known.measured), mock.patch("builtins.print"):

@@ -62,6 +62,8 @@ def parse(words):
     parser.add_argument("--adaptive", type=int, default=3, metavar="N", help="levels of steps by their error (default 3)")
     parser.add_argument("--solvers", nargs="+", default=["iterative", "direct", "reuse"],
                         help="solver files or names, the base first (default: iterative direct reuse)")
+    parser.add_argument("--tolerances", type=float, nargs="*", default=[1e-4, 1e-12], metavar="RTOL",
+                        help="-snes_rtol of further runs with the first solver (default 1e-4 1e-12)")
     parser.add_argument("--ranks", type=int, default=1)
     parser.add_argument("--launcher", default="mpiexec -n", help="words before the number of ranks (default: mpiexec -n)")
     parser.add_argument("--repeat", type=int, default=1, help="runs of each setting; times are medians (default 1)")

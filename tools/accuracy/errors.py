@@ -9,7 +9,9 @@ import math
 from dataclasses import dataclass, field
 
 from .extrapolate import Limit, limit
-from .settings import ORDERS, TIGHT, Setting
+from .settings import ORDERS, Setting
+
+LOOSE = 1e-8  # a tolerance below that of the solver files is taken as exact
 
 
 @dataclass(frozen=True)
@@ -96,11 +98,13 @@ def in_space(values, axes):
 
 def of_solver(values, axes):
     """The tightest solver's number; what the Newton steps left there is below rounding."""
-    tight = [values[s] for t in axes.solvers if str(f"{TIGHT:g}") in t.more
-             if (s := Setting(axes.base.mesh, axes.base.steps, t)) in values]
+    made = [(t.tolerance, values[s]) for t in axes.solvers if t.tolerance < LOOSE
+            if (s := Setting(axes.base.mesh, axes.base.steps, t)) in values]
     base = values[axes.base]
-    return Limit(tight[0], abs(tight[0] - base) * 1e-2, None, 1, "the tightest tolerance") if tight else \
-        Limit(base, 0, None, 1, "not examined")
+    if not made:
+        return Limit(base, 0, None, 1, "not examined")
+    tight = min(made)[1]
+    return Limit(tight, abs(tight - base) * 1e-2, None, 1, "the tightest tolerance")
 
 
 def estimate(key, values, axes):

@@ -12,6 +12,7 @@ QUESTION = ["pcv", "--lung", "30", "21", "15", "11", "--question", "C_rs=1%", "-
 # takes, has no limit as dt -> 0 but that of the mesh
 FLAGS = ["-ventilator_ramp_down", "0.1"]
 FINE, FINE_STEPS = 8.5, Steps("bdf", 0.05)
+TIME = [Steps("beuler", 0.025), Steps("bdf", 0.05), Steps("bdf", 0.025), Steps("beuler", 0.0125), Steps("bdf", 0.0125)]  # on the coarsest mesh
 
 
 def fine_setting(search, results):

@@ -7,7 +7,7 @@ from benchmarks.common import blas, markdown, processor, write_csv
 
 from . import fields, pictures
 from .numbers import file_name, percent, short
-from .settings import SCHEMES, plain_options
+from .settings import plain_options
 
 FIGURES = {"ladders": pictures.ladders, "pareto": pictures.pareto, "costs": pictures.costs, "spectrum": pictures.digits}
 

@@ -2,6 +2,7 @@
 import contextlib
 import io
 import json
+import math
 import re
 import resource
 import shlex
@@ -15,7 +16,6 @@ import meshio
 from benchmarks.common import SOLVERS, SOURCE, fail
 
 ADAPTIVE = 1e-2     # largest error that a step may make in the ladder of adaptive steps, of V_T and PIP
-LOOSE, TIGHT = 1e-4, 1e-12  # -snes_rtol around that of the solver file
 SCHEMES = {"beuler": "backward Euler", "bdf": "BDF2"}
 ORDERS = {"beuler": 1, "bdf": 2}
 AIRWAY = 5          # size of the lung's cells over that of the airway's (tools/lung_mesh: 15 and 3 mm)
@@ -56,10 +56,11 @@ class Steps:
 
 @dataclass(frozen=True)
 class Solver:
-    """A solver file and the options that follow it."""
+    """A solver file and the options that follow it; tolerance: -snes_rtol if they set it."""
     name: str
     file: Path
     more: tuple = ()
+    tolerance: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -149,7 +150,7 @@ def solvers(options):
             fail(f"there is no solver file {name}; there are {', '.join(p.stem for p in sorted(SOLVERS.glob('*.opts')))}")
         ladder.append(Solver(path.stem, path))
     base = ladder[0]
-    for rtol in (LOOSE, TIGHT):
-        more = ("-snes_rtol", f"{rtol:g}", "-snes_atol", "1e-12") if rtol == TIGHT else ("-snes_rtol", f"{rtol:g}")
-        ladder.append(Solver(f"{base.name}, snes_rtol {rtol:g}", base.file, more))
+    for rtol in options.tolerances:
+        more = ("-snes_rtol", f"{rtol:g}") + (("-snes_atol", "1e-12") if rtol < 1e-9 else ())
+        ladder.append(Solver(f"{base.name}, snes_rtol {rtol:g}", base.file, more, rtol))
     return ladder

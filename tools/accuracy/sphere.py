@@ -129,20 +129,26 @@ def cost_at(points, wanted):
 def factors(search, tolerances=(0.01, 0.001)):
     """Table: CPU seconds of each kind of steps on the base's mesh to an error in time, by number."""
     base, kinds = search.axes.base, [(s, a) for a in (False, True) for s in SCHEMES]
-    header = ["number", "error in time", *(SCHEMES[s] + (", adaptive" if a else "") + ": CPU s" for s, a in kinds), "backward Euler / BDF2"]
+    header = ["number", "error in time", *(SCHEMES[s] + (", adaptive" if a else "") + ": CPU s" for s, a in kinds), "backward Euler / BDF2", "the same in Krylov iterations"]
     table = []
+
+    def to_reach(key, wanted, scheme, adaptive, cost):
+        e = search.errors()[key]
+        return cost_at([(cost(search.ladder.done[s]), abs(e.parts[t] / e.value)) for t in search.axes.steps
+                        if t.scheme == scheme and bool(t.tolerance) == adaptive
+                        and (s := Setting(base.mesh, t, base.solver)) in search.ladder.done], wanted)
+
+    def ratio(a, b):
+        return text(a / b, "{:.2f}") if a and b else "-"
+
     for key, e in search.errors().items():
         for wanted in tolerances:
-            costs = []
-            for scheme, adaptive in kinds:
-                ladder = [(search.ladder.done[s].cpu, abs(e.parts[t] / e.value)) for t in search.axes.steps
-                          if t.scheme == scheme and bool(t.tolerance) == adaptive
-                          and (s := Setting(base.mesh, t, base.solver)) in search.ladder.done]
-                costs.append(cost_at(ladder, wanted))
+            costs = [to_reach(key, wanted, *kind, lambda run: run.cpu) for kind in kinds]
+            counts = [to_reach(key, wanted, *kind, lambda run: run.summary["krylov_iterations"]) for kind in kinds]
             if max(abs(p / e.value) for t, p in e.parts.items() if t in search.axes.steps) > wanted:
                 doubtful = e.shares["time"] / abs(e.value) > wanted / 2
                 table.append([short(key), f"{100 * wanted:g} %", *(text(c, "{:.2g}") for c in costs),
-                              (text(costs[0] / costs[1], "{:.2f}") if costs[0] and costs[1] else "-") + (" (limit in doubt)" if doubtful else "")])
+                              ratio(*costs[:2]) + (" (limit in doubt)" if doubtful else ""), ratio(*counts[:2])])
     return header, table
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from benchmarks.common import SOURCE
 
 sys.path.insert(0, str(SOURCE / "tests/verification/hollow_sphere"))
-from radial import ML, Pressure, Radial, Shell, breathe  # noqa: E402
+from radial import Pressure, Radial, Shell, breathe  # noqa: E402
 
 KPA_PER_CMH2O = 0.0980665
 BREATH = Pressure()
