@@ -192,6 +192,17 @@ class Searching(unittest.TestCase):
         self.assertTrue(all(why == "it was to fail" for why, _ in made.ladder.failed.values()))
         self.assertIsNotNone(made.answers()[1].run)
 
+    def test_steps_that_end_at_one_kink_are_no_limit(self):
+        """Two long steps of BDF2 that agree do not speak for the limit while backward Euler moves."""
+        made, _ = self.explored(3000)
+        axes, key = made.axes, "tidal_volume_ml"
+        moving = {settings.Steps("beuler", 0.2): 400, settings.Steps("beuler", 0.1): 400, settings.Steps("beuler", 0.05): 430,
+                  settings.Steps("bdf", 0.2): 420, settings.Steps("bdf", 0.1): 420}
+        values = {settings.Setting(axes.base.mesh, steps, axes.base.solver): v for steps, v in moving.items()}
+        self.assertGreater(estimate(key, values, axes).shares["time"], 25)
+        still = dict.fromkeys(values, 400.0)
+        self.assertLess(estimate(key, still, axes).shares["time"], 1e-3)
+
     def test_coupling_widens_the_reference(self):
         """Without joint runs the product of the parts is in doubt; with them it is seen."""
         made, known = self.explored(3000)

@@ -8,7 +8,7 @@ the smallest errors (the anchor) less its parts; its uncertainty is the sum of t
 import math
 from dataclasses import dataclass, field
 
-from .extrapolate import Limit, limit
+from .extrapolate import ROUNDING, Limit, limit
 from .settings import ORDERS, Setting
 
 LOOSE = 1e-8  # a tolerance below that of the solver files is taken as exact
@@ -73,13 +73,20 @@ class Errors:
 
 def in_time(values, axes):
     """Limits in time of each scheme on the base's mesh, and the surest of them; schemes that differ by more than both doubts
-    widen it, unless only one shows an order: where the other still wanders its limit says nothing."""
+    widen it, unless only one shows an order: where the other still wanders its limit says nothing. Levels of one scheme that agree
+    while those of the other do not are no limit either: long steps that all end at the same kink agree."""
     limits = {}
     for scheme in ORDERS:
         ladder = sorted(((t.dt, values[s]) for t in axes.steps if t.scheme == scheme and not t.tolerance
                          if (s := Setting(axes.base.mesh, t, axes.base.solver)) in values), reverse=True)
         if ladder:
             limits[scheme] = limit(*zip(*ladder), ORDERS[scheme])
+    made = [values[s] for t in axes.steps if not t.tolerance and (s := Setting(axes.base.mesh, t, axes.base.solver)) in values]
+    spread = max(made) - min(made)
+    still = ROUNDING * max(map(abs, made))
+    for scheme, found in limits.items():
+        if found.uncertainty <= still < spread and found.order is None:
+            limits[scheme] = Limit(found.value, spread, None, 1, found.how + ", not so the other scheme's")
     converging = [found for found in limits.values() if found.order is not None]
     chosen = min(converging or limits.values(), key=lambda found: found.uncertainty)
     for other in converging or limits.values():

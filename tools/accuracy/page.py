@@ -148,8 +148,8 @@ def write(search, command):
     if ladder.done:
         lines += [*reference_table(search), "",
                   "Limit: Richardson's extrapolation of each ladder (observed order; Celik et al. 2008), the parts of time, space and solver "
-                  f"taken off the numbers of {next(iter(search.all_errors().values())).anchor.name}. ±: sum of what the ladders' limits may be off and of the coupling between time and "
-                  "space that the joint runs show. It bounds what the ladders can see; an error common to all their levels (the shape of "
+                  f"taken off the numbers of {next(iter(search.all_errors().values())).anchor.name}. ±: sum of what the ladders' "
+                  "limits may be off and of the coupling between time and space that the joint runs show. It bounds what the ladders can see; an error common to all their levels (the shape of "
                   "a mesh that is refined without following the body) is not among it.", "", "## Runs", "",
                   "Errors in per cent of the limit, in brackets where they are below its uncertainty.", "", *run_table(search, found), ""]
         if reference:

@@ -91,8 +91,8 @@ def ladders(path, search):
         column[1].axhspan(FLOOR, np.clip(e.shares["space"] / abs(e.value), FLOOR, 1), color="#eeeeee", zorder=0)
         column[1].set(xscale="log", yscale="log", xlabel="tetrahedra")
         for axis in column:
-            low, high = axis.get_ylim()
-            axis.set_ylim(max(low, 1e-8), high)
+            drawn = [y for line in axis.lines for y in line.get_ydata()]
+            axis.set_ylim(min(drawn, default=FLOOR) / 3, 3 * max(drawn, default=1))
             axis.spines[["top", "right"]].set_visible(False)
     axes[0][0].set_ylabel("error in time")
     axes[1][0].set_ylabel("error in space")

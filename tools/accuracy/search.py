@@ -222,5 +222,6 @@ class Search:
             for name, ladder in (("the smallest error in space", self.axes.meshes), ("the smallest error in time", self.axes.steps)):
                 parts[name] = min((abs(e.parts[p] / e.value) for p in ladder if p in e.parts), default=math.inf)
             name = max(parts, key=parts.get)
-            worst.append((sum(parts.values()) / share, f"Furthest off is {short(key)}: {name} is {100 * parts[name]:.2g} %"))
+            size = f"{100 * parts[name]:.2g} %" if math.isfinite(parts[name]) else "not known: one level alone was run"
+            worst.append((sum(parts.values()) / share, f"Furthest off is {short(key)}: {name} is {size}"))
         return max(worst)[1] + "."

@@ -129,7 +129,8 @@ def cost_at(points, wanted):
 def factors(search, tolerances=(0.01, 0.001)):
     """Table: CPU seconds of each kind of steps on the base's mesh to an error in time, by number."""
     base, kinds = search.axes.base, [(s, a) for a in (False, True) for s in SCHEMES]
-    header = ["number", "error in time", *(SCHEMES[s] + (", adaptive" if a else "") + ": CPU s" for s, a in kinds), "backward Euler / BDF2", "the same in Krylov iterations"]
+    header = ["number", "error in time", *(SCHEMES[s] + (", adaptive" if a else "") + ": CPU s" for s, a in kinds),
+              "backward Euler / BDF2", "the same in Krylov iterations"]
     table = []
 
     def to_reach(key, wanted, scheme, adaptive, cost):
