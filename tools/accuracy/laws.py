@@ -7,6 +7,7 @@ from benchmarks.plots import plt, save
 from . import command, page
 from .extrapolate import limit
 from .numbers import ALIASES, short
+from .pictures import logarithmic
 from .settings import ORDERS, SCHEMES, Setting
 
 MESHES = {32: 7, 22.6: 4.95, 16: 3.5}  # mm: size and that of the airway; the first is meshes/lung_test.msh
@@ -91,10 +92,8 @@ def draw(path, searches):
             if points:
                 column[1].plot(*zip(*points), "D-", ms=4, lw=0.8, color=colour)
     for column, key in zip(axes.T, keys):
-        column[0].set(xscale="log", yscale="log", xlabel="Δt (s)", title=short(key))
-        column[1].set(xscale="log", yscale="log", xlabel="tetrahedra")
-        for axis in column:
-            axis.spines[["top", "right"]].set_visible(False)
+        logarithmic(column[0], xlabel="Δt (s)", title=short(key))
+        logarithmic(column[1], xlabel="tetrahedra")
     axes[0][0].set_ylabel("error in time")
     axes[1][0].set_ylabel("error in space")
     axes[0][0].legend(fontsize=7)

@@ -11,6 +11,7 @@ from benchmarks.common import environment, fail, markdown, write_csv
 from benchmarks.plots import plt, save
 
 from .extrapolate import limit
+from .pictures import logarithmic
 
 SPACE = re.compile(r"^  (\w+) +cube\w* +J [\d.]+  u (\S+)  Grad u (\S+)  p (\S+)  Grad p (\S+)", re.M)
 TIME = re.compile(r"^  (backward Euler|BDF2), (\w+) +dt 1/(\d+) +J [\d.]+  u (\S+)  p (\S+)", re.M)
@@ -73,8 +74,7 @@ def run(folder, results, build):
             if what == kind:
                 axis.plot(*zip(*ladder), {"u": "o-", "p": "s--", "Grad u": "^-", "Grad p": "v--"}[field], ms=4, lw=0.8, color=COLOURS[law],
                           label=f"{field}, {law}" if law == "yoshihara" else None)
-        axis.set(xscale="log", yscale="log", xlabel=kind.split(",")[0], title=kind.split(", ", 1)[1])
-        axis.spines[["top", "right"]].set_visible(False)
+        logarithmic(axis, xlabel=kind.split(",")[0], title=kind.split(", ", 1)[1])
         axis.legend(fontsize=7)
     axes[0][0].set_ylabel("error, L2")
     save(figure, folder / "manufactured.png", "Manufactured solutions at finite strain (blue, green, red, orange: yoshihara, birzle, berger, ma)")

@@ -1,5 +1,6 @@
 """Pictures of what accuracy costs: convergence of the ladders, errors over time, dofs and memory, Pareto front, digits."""
 import numpy as np
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from benchmarks.plots import plt, save
 
@@ -9,6 +10,17 @@ from .settings import SCHEMES, Setting
 FLOOR = 1e-9  # smallest error that is drawn
 KINDS = {("beuler", False): ("backward Euler", "o", "#2f6c9e"), ("bdf", False): ("BDF2", "s", "#b5403a"),
          ("beuler", True): ("backward Euler, adaptive", "^", "#7fb2d6"), ("bdf", True): ("BDF2, adaptive", "v", "#e39a90")}
+
+
+def logarithmic(axis, **labels):
+    """Both axes logarithmic, with few labels where x spans little."""
+    axis.set(xscale="log", yscale="log", **labels)
+    low, high = axis.get_xlim()
+    axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 100 * low else (1,)))
+    axis.xaxis.set_major_formatter("{x:g}")
+    axis.xaxis.set_minor_formatter(NullFormatter())
+    axis.tick_params(labelsize=8)
+    axis.spines[["top", "right"]].set_visible(False)
 
 
 def kind(setting):
@@ -56,8 +68,7 @@ def costs(path, search):
                     point(axis, value(run), abs(errors[key].of(run.numbers[key])), doubt(errors[key]), run.setting,
                           dark[run.setting.mesh.cells])
             axis.axhspan(FLOOR, doubt(errors[key]), color="#eeeeee", zorder=0)
-            axis.set(xscale="log", yscale="log")
-            axis.spines[["top", "right"]].set_visible(False)
+            logarithmic(axis)
             if key == shown[-1]:
                 axis.set_xlabel(label)
         low = min(max(abs(errors[key].of(r.numbers[key])), doubt(errors[key]), FLOOR) for r in runs if key in r.numbers)
@@ -73,7 +84,7 @@ def ladders(path, search):
     shown = [k for k, e in errors.items() if e.value and max(map(abs, e.parts.values())) > 1e-7 * abs(e.value)]
     if not shown:
         return
-    figure, axes = plt.subplots(2, len(shown), figsize=(1 + 2.7 * len(shown), 5.4), squeeze=False, layout="constrained")
+    figure, axes = plt.subplots(2, len(shown), figsize=(max(6.5, 1 + 2.7 * len(shown)), 5.4), squeeze=False, layout="constrained")
     for column, key in zip(axes.T, shown):
         e = errors[key]
         for scheme in SCHEMES:
@@ -85,15 +96,14 @@ def ladders(path, search):
                     label, marker, colour = KINDS[scheme, adaptive]
                     column[0].plot(*zip(*points), marker=marker, ms=4, lw=0.8, color=colour, label=label)
         column[0].axhspan(FLOOR, np.clip(e.shares["time"] / abs(e.value), FLOOR, 1), color="#eeeeee", zorder=0)
-        column[0].set(xscale="log", yscale="log", xlabel="steps", title=short(key))
+        logarithmic(column[0], xlabel="steps", title=short(key))
         points = sorted((m.cells, max(abs(e.parts[m] / e.value), FLOOR)) for m in axes_.meshes if m in e.parts)
         column[1].plot(*zip(*points), marker="D", ms=4, lw=0.8, color="#3b7d4f")
         column[1].axhspan(FLOOR, np.clip(e.shares["space"] / abs(e.value), FLOOR, 1), color="#eeeeee", zorder=0)
-        column[1].set(xscale="log", yscale="log", xlabel="tetrahedra")
+        logarithmic(column[1], xlabel="tetrahedra")
         for axis in column:
             drawn = [y for line in axis.lines for y in line.get_ydata()]
             axis.set_ylim(min(drawn, default=FLOOR) / 3, 3 * max(drawn, default=1))
-            axis.spines[["top", "right"]].set_visible(False)
     axes[0][0].set_ylabel("error in time")
     axes[1][0].set_ylabel("error in space")
     axes[0][0].legend(fontsize=7)
@@ -130,10 +140,9 @@ def pareto(path, search):
         if answer.run:
             axis.annotate(percent(answer.share), (search.ladder.seconds(answer.run), max(worst(search, answer.run))),
                           xytext=(6, 6), textcoords="offset points", fontsize=8)
-    axis.set(xscale="log", yscale="log", xlabel=f"{'CPU' if search.ladder.options.clock == 'cpu' else 'wall'} time (s)",
-             ylabel="largest error of " + ", ".join(map(short, search.errors())))
+    logarithmic(axis, xlabel=f"{'CPU' if search.ladder.options.clock == 'cpu' else 'wall'} time (s)",
+                ylabel="largest error of " + ", ".join(map(short, search.errors())))
     axis.legend(handles=legend_handles([r.setting for r in runs]), fontsize=7)
-    axis.spines[["top", "right"]].set_visible(False)
     save(figure, path, "Pareto front; marked: the cheapest run that surely meets a tolerance")
 
 

@@ -9,6 +9,7 @@ from benchmarks.plots import plt, save
 from . import command, truth
 from .extrapolate import limit as limit_of
 from .numbers import ALIASES, short
+from .pictures import logarithmic
 from .settings import ORDERS, SCHEMES, Setting, Steps
 
 LEVELS = (4, 6, 9)     # divisions of an octant's edge; three times as many layers
@@ -175,9 +176,8 @@ def run(folder, results, build):
         axis.plot(*zip(*[(dt, abs(e)) for dt, e in line]), marker="o" if "Euler" in label else "s", ms=4, lw=0.8,
                   ls="-" if "radial" in label else "--", label=label)
     axis.axhline(1, color="#999999", lw=0.6, ls=":")
-    axis.set(xscale="log", yscale="log", xlabel="Δt (s)", ylabel="error of V(1 s) in time (%)")
+    logarithmic(axis, xlabel="Δt (s)", ylabel="error of V(1 s) in time (%)")
     axis.legend(fontsize=7)
-    axis.spines[["top", "right"]].set_visible(False)
     save(figure, folder / "first_second.png", "Hollow sphere: V(1 s) against the radial solver at dt -> 0")
     middle = f"median {effects[len(effects) // 2]:.2f}, 5 to 95 % {effects[len(effects) // 20]:.2f} to {effects[-1 - len(effects) // 20]:.2f}" \
         if effects else "none is larger than the uncertainty"
