@@ -126,24 +126,29 @@ def front(points):
     return found
 
 
+def surely(search, run):
+    """The largest error that a run may have in an asked number: what the recommendations go by; 100 % at most."""
+    return min(1, search.worst(run, dict.fromkeys(search.errors(), 1.0)))
+
+
 def pareto(path, search):
-    """Largest error of the asked numbers over seconds, the front, and the recommended runs."""
+    """What each run may be off over seconds, the front, and the recommended runs."""
     runs = list(search.ladder.done.values())
     figure, axis = plt.subplots(figsize=(7, 4.6), layout="constrained")
     dark = shades(runs)
     for run in runs:
-        point(axis, search.ladder.seconds(run), *worst(search, run), run.setting, dark[run.setting.mesh.cells])
-    line = front([(search.ladder.seconds(r), max(worst(search, r)), r) for r in runs])
+        point(axis, search.ladder.seconds(run), surely(search, run), 0, run.setting, dark[run.setting.mesh.cells])
+    line = front([(search.ladder.seconds(r), surely(search, r), r) for r in runs])
     axis.step([p[0] for p in line], [p[1] for p in line], where="post", color="#555555", lw=0.8)
     for answer in search.answers():
         axis.axhline(answer.share, color="#999999", lw=0.6, ls="--")
         if answer.run:
-            axis.annotate(percent(answer.share), (search.ladder.seconds(answer.run), max(worst(search, answer.run))),
+            axis.annotate(percent(answer.share), (search.ladder.seconds(answer.run), surely(search, answer.run)),
                           xytext=(6, 6), textcoords="offset points", fontsize=8)
     logarithmic(axis, xlabel=f"{'CPU' if search.ladder.options.clock == 'cpu' else 'wall'} time (s)",
-                ylabel="largest error of " + ", ".join(map(short, search.errors())))
+                ylabel="largest error of " + ", ".join(map(short, search.errors())) + " that cannot be excluded")
     axis.legend(handles=legend_handles([r.setting for r in runs]), fontsize=7)
-    save(figure, path, "Pareto front; marked: the cheapest run that surely meets a tolerance")
+    save(figure, path, "Pareto front of the error that cannot be excluded; marked: recommended")
 
 
 def digits(path, search):
