@@ -10,7 +10,7 @@ from .numbers import ALIASES, short
 from .pictures import logarithmic
 from .settings import ORDERS, SCHEMES, Setting
 
-MESHES = {32: 7, 22.6: 4.95, 16: 3.5}  # mm: size and that of the airway; the first is meshes/lung_test.msh
+MESHES = {32: 7, 22.6: 4.95, 16: 3.5, 11.3: 2.5}  # mm: size and that of the airway; the first is meshes/lung_test.msh
 LAWS = {"berger": ("CM1", "#c1272d", ["-lumen_pressure"]), "ma": ("CM2", "#e08a1e", []), "birzle": ("CM3", "#3b8f4a", []),
         "yoshihara": ("CM4", "#2a6fb0", []), "rausch": ("CM5", "#6a4c93", [])}
 SOLVER = {"rausch": "reuse"}
@@ -57,7 +57,7 @@ def orders(found):
 def table(searches):
     """A row for each law and number."""
     header = ["law", "number", "limit", "± %", *(f"{SCHEMES[s]}: {what}" for s in SCHEMES for what in ("order", f"% at {SHOWN[0]:g} s", f"at {SHOWN[1]:g} s")),
-              "h: order", "% on the coarse mesh", "middle", "fine"]
+              "h: order", "% on the coarse mesh", *(["next"] * (len(MESHES) - 1))]
     rows = []
     for law, search in searches.items():
         for key, e in search.all_errors().items():
