@@ -14,7 +14,7 @@ PLAIN = "-predictor_increments 0 -snes_lag_jacobian 1 -snes_lag_preconditioner 1
 
 def fail(message):
     """Ends the program with one sentence."""
-    sys.exit(f"tools/benchmark: error: {message}")
+    sys.exit(f"tools/{Path(sys.argv[0]).name}: error: {message}")
 
 
 def processor():

@@ -132,7 +132,7 @@ PetscErrorCode errors(pulmo::Run &run, Vec local, double t, Errors &e)
     law.stress(exact, P);
     law.stress(computed, P_h);
     for (int i = 0; i < 9; ++i) e.tissue += J * s.weight * square(P[i] - P_h[i]) / (2 * run.model().modulus());
-    const double k = RationalPermeability::permeability(computed.J, {}).k;
+    const double k = mms::RationalPermeability::permeability(computed.J, {}).k;
     for (int i = 0; i < 3; ++i) {
       double flux = 0;
       for (int j = 0; j < 3; ++j) flux += computed.cof_F[3 * i + j] * (grad_p[j] - s.grad_p[j]);

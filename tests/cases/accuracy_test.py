@@ -1,0 +1,273 @@
+#!/usr/bin/python3
+"""tools/accuracy_cost: limits and their uncertainty, errors of fields, the order of the runs, the budget, the answers."""
+import argparse
+import csv
+import os
+import pathlib
+import re
+import subprocess
+import sys
+import unittest
+from unittest import mock
+
+import numpy as np
+
+import case_meshes
+import pulmo_case as pulmo
+
+sys.path.insert(0, os.path.join(pulmo.SOURCE, "tools"))
+from accuracy import command, extrapolate, fields, ladder, numbers, page, pictures, search, settings  # noqa: E402
+from accuracy.errors import Axes, estimate  # noqa: E402
+
+SCENE = ["-mesh_scale", "100", "-airflow_surfaces", "x1", "-chest_wall_surfaces", "x0,x1,y0,y1,z0,z1", "-ventilator_inspiration", "0.4",
+         "-ventilator_ramp_down", "0.1", "-ts_max_time", "0.8"]
+
+
+def tool(*arguments):
+    run = [os.path.join(pulmo.SOURCE, "tools/accuracy_cost"), *map(str, arguments)]
+    return subprocess.run(run, env=pulmo.ENVIRONMENT, capture_output=True, text=True, timeout=300, cwd=pulmo.SOURCE)
+
+
+def quadratic_nodes(points, tets):
+    """Points and ten-node cells (VTK order) of straight tetrahedra."""
+    edges = np.sort(np.stack([tets[:, list(e)] for e in fields.EDGES], axis=1), axis=2)
+    unique, inverse = np.unique(edges.reshape(-1, 2), axis=0, return_inverse=True)
+    return (np.concatenate([points, points[unique].mean(axis=1)]),
+            np.concatenate([tets, len(points) + inverse.reshape(-1, 6)], axis=1))
+
+
+class Limits(unittest.TestCase):
+    def test_order_and_limit_are_found(self):
+        for order, sizes in ((1, [4, 2, 1]), (2, [3, 1.7, 1.1]), (1.6, [0.2, 0.13, 0.05, 0.02])):
+            with self.subTest(order=order):
+                values = [7 - 0.3 * h ** order for h in sizes]
+                found = extrapolate.limit(sizes, values, 2)
+                self.assertAlmostEqual(found.order, order, places=6)
+                self.assertAlmostEqual(found.value, 7, places=8)
+                self.assertGreaterEqual(found.uncertainty, 0.25 * abs(7 - values[-1]) * (1 - 1e-9))
+
+    def test_uncertainty_holds_the_limit(self):
+        """Also with terms of higher order, two levels, a wrong formal order and oscillating levels; known limit 5."""
+        steps = 0.2 / 2.0 ** np.arange(5)
+        for name, error in (("mixed", lambda h: h + 4 * h ** 2), ("mixed signs", lambda h: h - 2 * h ** 2), ("half", lambda h: h ** 0.5),
+                            ("too good", lambda h: h ** 3), ("oscillating", lambda h: h * (-1) ** round(np.log2(0.2 / h)))):
+            for count in (2, 3, 4, 5):
+                sizes = steps[:count]
+                found = extrapolate.limit(sizes, [5 + error(h) for h in sizes], 2 if name == "too good" else 1)
+                with self.subTest(error=name, levels=count):
+                    self.assertLessEqual(abs(found.value - 5), found.uncertainty * (1 + 1e-9))
+        self.assertEqual(extrapolate.limit([1], [3], 1).uncertainty, np.inf)
+        self.assertLess(extrapolate.limit([4, 2, 1], [6, 6, 6], 1).uncertainty, 1e-6)
+
+    def test_pareto_front(self):
+        random = np.random.default_rng(3)
+        points = [(*random.random(2).round(1), i) for i in range(60)]
+        front = pictures.front(points)
+        for cost, error, _ in front:
+            self.assertFalse(any(c <= cost and e <= error and (c, e) != (cost, error) for c, e, _ in points))
+        for cost, error, _ in points:
+            self.assertTrue(any(c <= cost and e <= error for c, e, _ in front))
+
+
+class Fields(unittest.TestCase):
+    def test_polynomials_on_two_meshes(self):
+        """A known difference has its analytic norms on a mesh that is not nested in the other."""
+        def made(counts, lengths, u, p):
+            points, cells = quadratic_nodes(*case_meshes.kuhn(counts, lengths))
+            return fields.Fields(points, cells, u(*points.T), p(*points.T))
+
+        def u(x, y, z):
+            return np.stack([x * x - y * z, 1 + 2 * x * y, z * z + x], axis=1)
+
+        def off(x, y, z):
+            return u(x, y, z) + np.stack([x * y, 0 * x, 0.5 * z], axis=1)
+
+        fine = made((3, 4, 5), (1, 1, 1), u, lambda x, y, z: x + 2 * y)
+        coarse = made((2, 2, 3), (1, 1, 1), off, lambda x, y, z: x + 2 * y + 3 * z)
+        compare = fields.Comparison(fine)
+        same, found = compare(fine), compare(coarse)
+        for name in ("u L2", "u H1", "p L2"):
+            self.assertLess(same[name], 1e-13)
+        # squares over the cube: xy 1/9, z/2 1/12; gradients y, x: 2/3, 1/2: 1/4; 3 z: 3; x + 2 y: 1/3 + 1 + 4/3
+        self.assertAlmostEqual(found["u L2"] * compare.norm(compare.values[0]), (1 / 9 + 1 / 12) ** 0.5, places=10)
+        self.assertAlmostEqual(found["u H1"] * compare.norm(compare.values[1]), (2 / 3 + 1 / 4) ** 0.5, places=10)
+        self.assertAlmostEqual(found["p L2"], (3 / (1 / 3 + 1 + 4 / 3)) ** 0.5, places=10)
+        self.assertAlmostEqual(compare.norm(compare.values[1]) ** 2, 4 / 3 + 2 / 3 + 8 / 3 + 4 / 3 + 1, places=10)
+        self.assertEqual(found["outside"], 0)
+        smaller = compare(made((2, 2, 2), (0.9, 1, 1), u, lambda x, y, z: x + 2 * y))
+        self.assertAlmostEqual(smaller["outside"], 0.1, delta=0.04)  # counted by points
+        self.assertLess(smaller["u L2"], 1e-12)  # the same polynomial, extrapolated
+
+
+class Known:
+    """Stands for the program: numbers with known limits, errors and costs."""
+    LIMITS = {"tidal_volume_ml": 500.0, "compliance_ml_per_cmH2O": 80.0}
+
+    def __init__(self, cells, fails=None):
+        self.cells, self.fails, self.calls = cells, fails or (lambda words: False), []
+
+    def true_error(self, words, key):
+        options = dict(zip(words, words[1:]))
+        h = self.cells[options["-dm_plex_filename"]] ** (-1 / 3)
+        dt, order = float(options["-ts_dt"]), 1 if options["-ts_type"] == "beuler" else 2
+        a = 2.0 if key == "tidal_volume_ml" else 0.7
+        return (1 + a * h ** 2 + h ** 3) * (1 - a * dt ** order / order) - 1
+
+    def measured(self, words, folder, repeat, ranks, timeout):
+        words = list(map(str, words))
+        self.calls.append(words)
+        options = dict(zip(words, words[1:]))
+        steps = 3 / float(options["-ts_dt"])
+        cells = self.cells[options["-dm_plex_filename"]]
+        spent = 1e-4 * steps * cells * (1.3 if options["-ts_type"] == "bdf" else 1)
+        values = {key: limit * (1 + self.true_error(words, key)) for key, limit in self.LIMITS.items()}
+        failed = self.fails(options)
+        failed, spent = failed or spent > timeout, min(spent, timeout)
+        return {"code": int(failed), "reason": "it was to fail", "cpu": spent, "wall": spent, "memory": cells / 100, "kept": False,
+                "load": [0, 0], "folder": pathlib.Path("nowhere"),
+                "summary": values | {"breaths": [values], "steps": steps, "cells": cells, "dofs": 6 * cells}}
+
+
+class Searching(unittest.TestCase):
+    def explored(self, budget, asked=None, fails=None):
+        cells = {f"{n}.msh": n for n in (1000, 2500, 6000, 15000)}
+        options = argparse.Namespace(budget=budget, clock="wall", repeat=1, ranks=1, build=pathlib.Path("build"), output=pathlib.Path("nowhere"),
+                                     results=pathlib.Path("nowhere"), schemes=["beuler", "bdf"], dt_factors=[4, 2, 1, 0.5, 0.25, 0.125],
+                                     adaptive=0, solvers=["iterative"], tolerances=[])
+        meshes = [settings.Mesh(name, ("-dm_plex_filename", name), n) for name, n in cells.items()]
+        steps, solvers = settings.steps(options, 0.05), settings.solvers(options)
+        base = settings.Setting(meshes[0], next(t for t in steps if t.dt == 0.05), solvers[0])
+        known = Known(cells, fails)
+        with mock.patch.object(ladder.runs, "measured", known.measured), mock.patch("builtins.print"):
+            made = search.Search(ladder.Ladder(Axes(meshes, steps, solvers, base), [], [], options), list(Known.LIMITS), asked or {},
+                                 numbers.LEVELS)
+            made.explore()
+        return made, known
+
+    def true_errors(self, made, known, setting):
+        words = [str(w) for w in made.ladder.command(setting)]
+        return {key: abs(known.true_error(words, key)) for key in Known.LIMITS}
+
+    def test_budget_and_answers(self):
+        previous = 0
+        for budget in (20, 100, 600, 3000):
+            made, known = self.explored(budget)
+            with self.subTest(budget=budget):
+                spent = sum(r.wall for r in made.ladder.done.values()) + sum(seconds for _, seconds in made.ladder.failed.values())
+                self.assertLessEqual(spent, budget * (1 + 1e-9))
+                self.assertEqual(len(known.calls), len(made.ladder.done) + len(made.ladder.failed))
+                self.assertGreaterEqual(len(made.ladder.done), previous)
+                previous = len(made.ladder.done)
+                left = {s for s in made.axes.singles() if s not in made.ladder.done}
+                self.assertTrue(left <= {*made.ladder.skipped, *made.ladder.failed})
+                for key, e in made.errors().items():
+                    self.assertLessEqual(abs(e.value - Known.LIMITS[key]), e.uncertainty, key)
+                for answer in made.answers():
+                    if answer.run:
+                        self.assertLessEqual(max(self.true_errors(made, known, answer.run.setting).values()), answer.share)
+        answers = {a.share: a for a in made.answers()}
+        self.assertIsNotNone(answers[0.01].run)
+        self.assertIsNotNone(answers[0.05].run)
+        self.assertLess(answers[0.05].run.cpu, answers[0.01].run.cpu)
+        # nothing that was run is cheaper and as good, whatever cancels
+        surely = [r.cpu for s, r in made.ladder.done.items()
+                  if max(max(self.true_errors(made, known, s)[k], e.predicted(s)) + e.doubt for k, e in made.errors().items()) <= 0.0099]
+        self.assertLessEqual(answers[0.01].run.cpu, min(surely))
+
+    def test_question_ends_the_ladder(self):
+        full, _ = self.explored(3000)
+        made, known = self.explored(3000, {"compliance_ml_per_cmH2O": 0.02})
+        answer, = made.answers()
+        self.assertLess(len(made.ladder.done), len(full.ladder.done))
+        self.assertLess(made.ladder.spent, 0.5 * full.ladder.spent)
+        self.assertLessEqual(self.true_errors(made, known, answer.run.setting)["compliance_ml_per_cmH2O"], 0.02)
+        self.assertIn("C_rs within 2 %", made.sentences()[0])
+        hopeless, _ = self.explored(10, {"compliance_ml_per_cmH2O": 1e-6})
+        self.assertIsNone(hopeless.answers()[0].run)
+        self.assertIn("budget", hopeless.sentences()[0])
+
+    def test_failures_are_kept_apart(self):
+        made, _ = self.explored(3000, fails=lambda options: float(options["-ts_dt"]) == 0.2)
+        self.assertEqual({s.steps.dt for s in made.ladder.failed}, {0.2})
+        self.assertTrue(all(why == "it was to fail" for why, _ in made.ladder.failed.values()))
+        self.assertIsNotNone(made.answers()[1].run)
+
+    def test_steps_that_end_at_one_kink_are_no_limit(self):
+        """Two long steps of BDF2 that agree do not speak for the limit while backward Euler moves."""
+        made, _ = self.explored(3000)
+        axes, key = made.axes, "tidal_volume_ml"
+        moving = {settings.Steps("beuler", 0.2): 400, settings.Steps("beuler", 0.1): 400, settings.Steps("beuler", 0.05): 430,
+                  settings.Steps("bdf", 0.2): 420, settings.Steps("bdf", 0.1): 420}
+        values = {settings.Setting(axes.base.mesh, steps, axes.base.solver): v for steps, v in moving.items()}
+        self.assertGreater(estimate(key, values, axes).shares["time"], 25)
+        still = dict.fromkeys(values, 400.0)
+        self.assertLess(estimate(key, still, axes).shares["time"], 1e-3)
+
+    def test_coupling_widens_the_reference(self):
+        """Without joint runs the product of the parts is in doubt; with them it is seen."""
+        made, known = self.explored(3000)
+        axes, key = made.axes, "tidal_volume_ml"
+        alone = {s: v for s, v in made.ladder.values(key).items() if s in axes.singles()}
+        for values in (alone, made.ladder.values(key)):
+            e = estimate(key, values, axes)
+            self.assertGreater(e.shares["coupling"], 0)
+            self.assertLessEqual(abs(e.value - 500), e.uncertainty)
+
+
+class Tool(unittest.TestCase):
+    def test_words(self):
+        self.assertEqual(numbers.question("C_rs=1%"), ("compliance_ml_per_cmH2O", 0.01))
+        self.assertEqual(numbers.question("work_j = 0.05"), ("work_j", 0.05))
+        for text in ("C_rs", "C_rs=much", "C_rs=150%"):
+            self.assertRaises(ValueError, numbers.question, text)
+        self.assertEqual([command.seconds(t) for t in ("90", "90s", "10min", "2h")], [90, 90, 600, 7200])
+        self.assertEqual(page.merged(["# a", "-x 1", "-y", "-x 2"]), ["# a", "-y", "-x 2"])
+        self.assertEqual(settings.of_files(pulmo.DIRECT, "-ts_dt"), "0.05")
+        self.assertEqual(settings.of_files(pulmo.DIRECT + ["-ts_dt", "0.1"], "-ts_dt"), "0.1")
+
+    def test_recommended_setting_keeps_its_promise(self):
+        """A question on a small block; a run that is far finer in space and time, by BDF2, confirms; a second call runs nothing."""
+        folder = pathlib.Path(pulmo.scratch())
+        call = ["pcv", "--build", os.path.dirname(pulmo.PROGRAM), "--solvers", "direct", "--output", folder, "--budget", "2min", "--clock",
+                "cpu", "--adaptive", "1", "--dt-factors", "2", "1", "0.5", "--schemes", "beuler", "--question", "V_T=8%", "--question",
+                "C_rs=8%", "--", "-dm_plex_filename", pulmo.mesh("cube_coarse.msh"), *SCENE]
+        first = tool(*call)
+        self.assertEqual(first.returncode, 0, first.stdout + first.stderr)
+        text = (folder / "README.md").read_text()
+        self.assertIn("**V_T within 8 %, C_rs within 8 %**: cube_coarse", text)
+        with open(folder / "accuracy.csv", newline="") as f:
+            rows = list(csv.DictReader(f))
+        self.assertEqual({row["scheme"] for row in rows}, {"beuler"})
+        self.assertGreater(float(rows[-1]["error_u_l2"] or rows[0]["error_u_l2"]), 0)
+        for name in ("ladders", "pareto", "costs", "spectrum"):
+            self.assertEqual((folder / f"{name}.png").read_bytes()[:8], b"\x89PNG\r\n\x1a\n")
+
+        options = ["-options_file", str(folder / "recommended_8percent.opts")]
+        mesh = ["-dm_plex_filename", pulmo.mesh("cube_coarse.msh")]
+        cheap = pulmo.finished(pulmo.PCV + mesh + SCENE + options).json()
+        fine = pulmo.finished(pulmo.PCV + pulmo.options_file("solvers/iterative.opts") + ["-dm_plex_filename", pulmo.mesh("cube_fine.msh")] +
+                              SCENE + ["-ts_type", "bdf", "-ts_dt", "0.02"]).json()
+        for key in ("tidal_volume_ml", "compliance_ml_per_cmH2O"):
+            self.assertLess(abs(cheap[key] / fine[key] - 1), 0.08, key)
+            self.assertIn(f"{cheap[key]:.8g}", [row[key] for row in rows])
+
+        again = tool(*call)
+        self.assertIn(" 0 of them new", again.stdout)
+        with open(folder / "accuracy.csv", newline="") as f:
+            self.assertEqual(list(csv.DictReader(f)), rows)
+        self.assertEqual(re.search(r"\*\*V_T.*", (folder / "README.md").read_text())[0], re.search(r"\*\*V_T.*", text)[0])
+
+    def test_refuses(self):
+        for arguments, named in ((["nowhere"], "nowhere"), (["pcv", "--question", "C_rs"], "C_rs=1%"), (["pcv", "--budget", "soon"], "soon"),
+                                 (["pcv", "--meshes", "none.msh"], "none.msh"), (["pcv", "--solvers", "nothing"], "direct"),
+                                 (["pcv", "--dt-factors", "2", "--meshes", pulmo.mesh("cube_lung.msh")], "--dt-factors"),
+                                 (["pcv", "--", "-output_dir", "here"], "-output_dir")):
+            with self.subTest(arguments=arguments):
+                refused = tool("--build", os.path.dirname(pulmo.PROGRAM), "--output", pulmo.scratch(), *arguments)
+                self.assertNotEqual(refused.returncode, 0)
+                self.assertIn(named, refused.stderr)
+                self.assertNotIn("Traceback", refused.stderr)
+
+
+if __name__ == "__main__":
+    pulmo.main()

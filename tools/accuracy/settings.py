@@ -1,0 +1,156 @@
+"""What a run is set to: mesh, steps in time, solver; and the ladder of each."""
+import contextlib
+import io
+import json
+import math
+import re
+import resource
+import shlex
+import subprocess
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import meshio
+
+from benchmarks.common import SOLVERS, SOURCE, fail
+
+ADAPTIVE = 1e-2     # largest error that a step may make in the ladder of adaptive steps, of V_T and PIP
+SCHEMES = {"beuler": "backward Euler", "bdf": "BDF2"}
+ORDERS = {"beuler": 1, "bdf": 2}
+AIRWAY = 5          # size of the lung's cells over that of the airway's (tools/lung_mesh: 15 and 3 mm)
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A level in space. words: options that give it. cells: tetrahedra. file: what to make it of, for the reader."""
+    name: str
+    words: tuple
+    cells: int
+
+    def size(self):
+        """Relative mean edge length."""
+        return self.cells ** (-1 / 3)
+
+
+@dataclass(frozen=True)
+class Steps:
+    """A level in time: integrator, size of the (first) step in s; with a tolerance (of V_T and of PIP) steps by their error."""
+    scheme: str
+    dt: float
+    tolerance: float = 0
+
+    @property
+    def name(self):
+        adaptive = f", error of a step {100 * self.tolerance:.2g} %" if self.tolerance else ""
+        return f"{SCHEMES[self.scheme]} {'from ' if self.tolerance else ''}{self.dt:.6g} s{adaptive}"
+
+    def words(self, volume, pressure):
+        """Options; volume and pressure: V_T (ml) and PIP (cmH2O) that the tolerance refers to."""
+        words = ["-ts_type", self.scheme, "-ts_dt", f"{self.dt:.10g}"]
+        if self.tolerance:
+            words += ["-step_volume_tolerance", f"{self.tolerance * volume:.3g}",
+                      "-step_pressure_tolerance", f"{self.tolerance * pressure:.3g}"]
+        return words
+
+
+@dataclass(frozen=True)
+class Solver:
+    """A solver file and the options that follow it; tolerance: -snes_rtol if they set it."""
+    name: str
+    file: Path
+    more: tuple = ()
+    tolerance: float = math.inf
+
+
+@dataclass(frozen=True)
+class Setting:
+    mesh: Mesh
+    steps: Steps
+    solver: Solver
+
+    @property
+    def name(self):
+        return f"{self.mesh.name} | {self.steps.name} | {self.solver.name}"
+
+
+def of_files(words, key, default=None):
+    """Last value of an option among words and the option files that they name, as PETSc reads them."""
+    for word, value in zip(words, [*words[1:], None]):
+        if word == "-options_file" and value and Path(value).is_file():
+            default = of_files(plain_options(Path(value)), key, default)
+        elif word == key:
+            default = value
+    return default
+
+
+def plain_options(path):
+    """Words of an option file."""
+    return [word for line in path.read_text().splitlines() for word in shlex.split(re.sub(r"(^|\s)#.*", "", line))]
+
+
+def cells_of(path):
+    """Tetrahedra of a mesh file."""
+    with contextlib.redirect_stdout(io.StringIO()):  # meshio prints empty lines
+        return sum(len(block.data) for block in meshio.read(path).cells if block.type == "tetra")
+
+
+def lung(size, folder, clock):
+    """A pair of built-in lungs of a size (mm), made by tools/lung_mesh unless it is there; and the seconds that took."""
+    path = folder / f"pair_{size:g}.msh"
+    seconds = folder / f"pair_{size:g}.json"
+    if not seconds.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        print(f"making {path.name} ...", flush=True)
+        begin, before = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
+        made = subprocess.run([SOURCE / "tools/lung_mesh", "--side", "both", "--size", f"{size:g}", "--airway-size",
+                               f"{size / AIRWAY:g}", "--output", path], capture_output=True, text=True)
+        if made.returncode:
+            fail(made.stderr.strip().splitlines()[-1])
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        seconds.write_text(json.dumps({"wall": time.monotonic() - begin,
+                                       "cpu": after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime}) + "\n")
+    return path, json.loads(seconds.read_text())[clock]
+
+
+def meshes(options, scene):
+    """The ladder in space, coarse to fine, and the seconds that making it took."""
+    given, seconds = list(options.meshes or []), 0
+    own = of_files(scene, "-dm_plex_filename")
+    if options.lung or not (given or own):
+        made = [lung(size, options.results / "meshes", options.clock) for size in sorted(options.lung or [30, 21, 15], reverse=True)]
+        given, seconds = [path for path, _ in made], sum(s for _, s in made)
+    ladder = []
+    for path in given or [Path(own)]:
+        if not path.is_file():
+            fail(f"there is no mesh {path}")
+        words, cells = (("-dm_plex_filename", str(path)) if given else ()), cells_of(path)
+        for level in range(options.refine + 1):
+            refined = ("-dm_refine", str(level)) if level else ()
+            ladder.append(Mesh(path.stem + (f" refined {level} x" if level else ""), words + refined, cells * 8 ** level))
+    return sorted(ladder, key=lambda mesh: mesh.cells), seconds
+
+
+def steps(options, dt):
+    """The ladder in time."""
+    ladder = [Steps(scheme, dt * factor) for scheme in options.schemes for factor in options.dt_factors]
+    for scheme in options.schemes:
+        for k in range(options.adaptive):
+            # the local error of a step goes with its size to the order + 1
+            ladder.append(Steps(scheme, dt / 4 / 2 ** k, ADAPTIVE / 2 ** (k * (ORDERS[scheme] + 1))))
+    return ladder
+
+
+def solvers(options):
+    """The solvers: the base first, then looser and tighter Newton tolerances, then other files."""
+    ladder = []
+    for name in options.solvers:
+        path = Path(name) if Path(name).is_file() else SOLVERS / f"{name}.opts"
+        if not path.is_file():
+            fail(f"there is no solver file {name}; there are {', '.join(p.stem for p in sorted(SOLVERS.glob('*.opts')))}")
+        ladder.append(Solver(path.stem, path))
+    base = ladder[0]
+    for rtol in options.tolerances:
+        more = ("-snes_rtol", f"{rtol:g}") + (("-snes_atol", "1e-12") if rtol < 1e-9 else ())
+        ladder.append(Solver(f"{base.name}, snes_rtol {rtol:g}", base.file, more, rtol))
+    return ladder
