@@ -18,6 +18,9 @@ constexpr double least_ratio = 1.2;
 /// Volumes at rest of two meshes of one lung differ by less than this share.
 constexpr double same_lung = 0.1;
 
+/// Factors of safety of an extrapolation whose order is as it should be, or not (Oberkampf & Roy 2010).
+constexpr double factor_of_safety = 1.25, doubtful_factor = 3;
+
 /// Solver tolerances are tightened by this factor, but not to rounding.
 constexpr PetscReal tighter = 0.01, tightest = 1e-12;
 
@@ -86,15 +89,15 @@ std::optional<std::pair<double, double>> both(const ErrorLevel &a, const ErrorLe
 TimeError time_error(double fine, double twice, double four_times, int order)
 {
   const double near = fine - twice, far = twice - four_times;
-  if (near == 0 || !(far / near > 0)) return {1.25 * std::max(std::abs(near), std::abs(far)), {}};
+  if (near == 0 || !(far / near > 0)) return {factor_of_safety * std::max(std::abs(near), std::abs(far)), {}};
   const double observed = std::log2(far / near), used = std::clamp(observed, 0.5, double(order)),
-               safety = std::abs(observed - order) <= 0.1 * order ? 1.25 : 3;
+               safety = std::abs(observed - order) <= 0.1 * order ? factor_of_safety : doubtful_factor;
   return {safety * std::abs(near) / (std::exp2(used) - 1), observed};
 }
 
 double space_error(double difference, double ratio)
 {
-  return std::abs(difference / (1 - ratio));
+  return factor_of_safety * std::abs(difference / (1 - ratio));
 }
 
 std::optional<double> ErrorBar::total() const

@@ -1,0 +1,163 @@
+"""Error bars of -error_estimate held against true errors.
+
+Scenes and their truth:
+  block         24 cells, all five laws; in time: steps 32 times as short with BDF2, in space: cells a quarter of the size
+  sphere        an octant of the hollow sphere; in all: the radial solver
+  lung          one lung of 1,324 cells; in time and in space as the block
+  manufactured  a manufactured finite-strain breath; in all: its closed form (tests/verification/manufactured_breath)
+"""
+import json
+import statistics
+import subprocess
+from pathlib import Path
+
+from benchmarks import runs
+from benchmarks.common import SCENES, SOLVERS, SOURCE, environment, fail, markdown, require, write_csv
+
+from . import truth
+from .numbers import short
+
+NUMBERS = ["tidal_volume_ml", "peak_flow_ml_per_s", "peak_expiratory_flow_ml_per_s", "compliance_ml_per_cmH2O",
+           "resistance_cmH2O_s_per_l", "time_constant_s", "dynamic_compliance_ml_per_cmH2O", "work_j", "auto_peep_cmH2O",
+           "trapped_volume_ml", "mechanical_power_j_per_min", "strain"]
+SCHEMES = {"backward Euler": [], "BDF2": ["-ts_type", "bdf"]}
+QUIET = ["-progress", "off", "-energy_audit", "off"]
+LAWS = ["berger", "ma", "birzle", "yoshihara", "rausch"]
+ROLLERS = ["-support", "-support_surfaces", "x0,y0,z0", "-support_components_x0", "x", "-support_components_y0", "y",
+           "-support_components_z0", "z"]
+
+
+class Study:
+    def __init__(self, build, folder):
+        self.build, self.folder, self.rows = build, folder, []
+
+    def run(self, options):
+        """The summary of a run."""
+        command = [self.build / "pulmo", *options, *QUIET, "-output_dir"]
+        result = runs.measured(command, self.folder / "runs")
+        print(f"  {result['cpu']:6.1f} s CPU{' (kept)' if result['kept'] else ''}  {' '.join(map(str, options[-8:]))}", flush=True)
+        if result["code"]:
+            fail(f"{result['reason']}; see {result['folder']}")
+        return result["summary"]
+
+    def compare(self, scene, part, bars, truth):
+        """A row for each number that the scene leaves free: bars[key] -> (value, bar), truth[key] -> value."""
+        for key in NUMBERS:
+            if key not in bars or truth.get(key) is None:
+                continue
+            value, bar = bars[key]
+            error = abs(value - truth[key])
+            if bar is not None and bar > 1e-9 * abs(value):
+                self.rows.append({"scene": scene, "part": part, "number": key, "value": value, "error": error, "bar": bar,
+                                  "effectivity": bar / error if error else float("inf"), "held": bar >= error})
+
+    def against_finer(self, scene, options, dt, steps=True, cells=True):
+        """Both parts for both schemes (space: once), against runs far finer in that direction alone."""
+        for scheme, words in SCHEMES.items():
+            estimate = self.run([*options, "-ts_dt", str(dt), *words, "-error_estimate"])["error_estimate"]["numbers"]
+            if steps:
+                truth = self.run([*options, "-ts_dt", str(dt / 32), *SCHEMES["BDF2"]])
+                self.compare(f"{scene}, {scheme}", "time", {k: (b["value"], b["time"]) for k, b in estimate.items()}, truth)
+            if cells and scheme == "backward Euler":
+                coarse = self.run([*options, "-ts_dt", str(4 * dt)])
+                truth = self.run([*options, "-ts_dt", str(4 * dt), "-dm_refine", "2"])
+                self.compare(scene, "space", {k: (coarse[k], b["space"]) for k, b in estimate.items()}, truth)
+
+
+def octant_numbers():
+    """Clinical numbers of an octant of the sphere by the radial solver: an eighth of the gas, eight times the resistance."""
+    shares = {"resistance_cmH2O_s_per_l": 8, "time_constant_s": 1}
+    return {key: value * shares.get(key, 1 / 8) for key, value in truth.numbers().items()}
+
+
+def block(study):
+    for law in LAWS:
+        mesh = ["-dm_plex_filename", SOURCE / "meshes/cube_coarse.msh", "-mesh_scale", "100"]
+        study.against_finer(f"block, {law}", ["-options_file", SOLVERS / "direct.opts", *mesh, "-tissue", law, "-airflow",
+                            "-airflow_permeability", "100", "-airflow_surfaces", "x1", "-chest_wall", "-chest_wall_surfaces",
+                            "x0,y0,y1,z0,z1", "-lumen_pressure", "-lumen_pressure_surfaces", "x1", "-ventilator", "pcv",
+                            "-ventilator_pip", "8", "-ventilator_inspiration", "0.8", "-ventilator_expiration", "0.8",
+                            "-ventilator_ramp", "0.2", "-ventilator_ramp_down", "0.2"], 0.05)
+
+
+def lung(study):
+    study.against_finer("lung, birzle", ["-options_file", SCENES / "pcv.opts", "-options_file",
+                        SOLVERS / "iterative.opts", "-ventilator_ramp_down", "0.1", "-dm_plex_filename",
+                        SOURCE / "meshes/lung_test.msh"], 0.05)
+
+
+def sphere(study):
+    exact = octant_numbers()
+
+    def mesh(divisions):
+        path = study.folder / f"octant_{divisions}.msh"
+        if not path.exists():
+            subprocess.run([SOURCE / "tools/sphere_mesh", "--octant", "--divisions", str(divisions), "--layers",
+                            str(3 * divisions), "--output", path], check=True, stdout=subprocess.DEVNULL)
+        return path
+
+    for scheme, words in SCHEMES.items():
+        for dt in (0.1, 0.05):
+            for divisions, other in ((6, 4), (4, 6)):
+                summary = study.run(["-options_file", SOLVERS / "direct.opts", "-options_file",
+                                     SCENES / "hollow_sphere.opts", *ROLLERS, "-dm_plex_filename", mesh(divisions),
+                                     "-ts_dt", str(dt), *words, "-error_estimate", "-error_estimate_mesh", mesh(other)])
+                bars = {k: (b["value"], b["error"]) for k, b in summary["error_estimate"]["numbers"].items()}
+                study.compare(f"sphere, {summary['cells']} cells beside {mesh(other).stem.split('_')[1]} divisions, "
+                              f"{dt} s, {scheme}", "all", bars, exact)
+
+
+def manufactured(study):
+    for mesh in ("cube_coarse", "cube"):
+        kept = study.folder / f"manufactured_{mesh}.txt"
+        if not kept.exists():
+            program = study.build / "tests/verification/verification_manufactured_breath"
+            text = subprocess.run([program], cwd=SOURCE, check=True, capture_output=True, text=True,
+                                  env=dict(environment(), PULMO_MANUFACTURED_MESH=mesh)).stdout
+            kept.write_text(text)
+        for line in kept.read_text().splitlines():
+            if line.startswith("row "):
+                row = json.loads(line[4:])
+                if row["number"] in NUMBERS:
+                    study.rows.append({**row, "scene": "manufactured, " + row["scene"], "part": "all",
+                                       "effectivity": row["bar"] / row["error"], "held": row["bar"] >= row["error"]})
+
+
+def tables(rows):
+    """Lines of two tables: the scenes, and all that is not held."""
+    groups = {}
+    for row in rows:
+        groups.setdefault((row["scene"], row["part"]), []).append(row)
+    table = []
+    for (scene, part), group in groups.items():
+        ratios = sorted(r["effectivity"] for r in group)
+        worst = max(group, key=lambda r: r["error"] / abs(r["value"]))
+        table.append([scene, part, f"{sum(r['held'] for r in group)} of {len(group)}", f"{ratios[0]:.2g}",
+                      f"{statistics.median(ratios):.2g}", f"{ratios[-1]:.2g}",
+                      f"{100 * worst['error'] / abs(worst['value']):.2g} % ({short(worst['number'])})"])
+    lines = markdown(["scene", "part", "held", "least", "median", "largest effectivity", "largest true error"], table)
+    misses = [r for r in rows if not r["held"]]
+    if misses:
+        lines += ["", "Not held:", "", *markdown(["scene", "part", "number", "value", "error", "bar"],
+                  [[r["scene"], r["part"], short(r["number"]), f"{r['value']:.5g}", f"{r['error']:.2g}", f"{r['bar']:.2g}"]
+                   for r in misses])]
+    return lines
+
+
+def run(folder, results, build):
+    study = Study(Path(build[1]).resolve() if build else SOURCE / "build", results.resolve())
+    require(study.build, [])
+    study.folder.mkdir(parents=True, exist_ok=True)
+    for scene in (block, sphere, lung, manufactured):
+        scene(study)
+    header = ["scene", "part", "number", "value", "error", "bar", "effectivity", "held"]
+    write_csv(folder / "bars.csv", header,
+              [[r["scene"], r["part"], r["number"], *(f"{r[c]:.6g}" for c in header[3:7]), r["held"]] for r in study.rows])
+    held = sum(r["held"] for r in study.rows)
+    lines = ["# Error bars against true errors", "", "    tools/accuracy_study bars", "",
+             f"**{held} of {len(study.rows)} bars ({100 * held / len(study.rows):.0f} %) hold the true error**; effectivity (bar over "
+             f"error): median {statistics.median(r['effectivity'] for r in study.rows):.2g}. How the bars are made: "
+             "[error bars](../error_bars.md). All rows: bars.csv.", "",
+             "Part: in `time` the truth is a run of BDF2 with steps 32 times as short; in `space` one of cells a quarter of the size "
+             "(bars and errors at steps of 4 Δt); in `all` the radial solver or the closed form.", "", *tables(study.rows)]
+    (folder / "README.md").write_text("\n".join(lines) + "\n")
