@@ -18,8 +18,9 @@ namespace fs = std::filesystem;
 
 /// Options under these prefixes may change at a restart: the mesh and the programme are compared themselves, the rest
 /// does not change what is computed, but how.
-constexpr std::array<const char *, 10> free_prefixes{"-mesh",   "-ventilator", "-predictor", "-newton",     "-step",
-                                                     "-output", "-progress",   "-effects",   "-checkpoint", "-restart"};
+constexpr std::array<const char *, 11> free_prefixes{"-mesh",       "-ventilator", "-predictor",     "-newton",
+                                                     "-step",       "-output",     "-progress",      "-effects",
+                                                     "-checkpoint", "-restart",    "-error_estimate"};
 constexpr const char *flow_split = "-ventilator_flow_split"; // no part of the programme
 
 bool is_free(const std::string &option)

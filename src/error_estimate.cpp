@@ -21,6 +21,10 @@ constexpr double same_lung = 0.1;
 /// Factors of safety of an extrapolation whose order is as it should be, or not (Oberkampf & Roy 2010).
 constexpr double factor_of_safety = 1.25, doubtful_factor = 3;
 
+/// Steps that are less longer than this, of those asked to be twice as long, tell nothing of the error in time: they
+/// land on the ends of phases.
+constexpr double least_coarsening = 1.2;
+
 /// Solver tolerances are tightened by this factor, but not to rounding.
 constexpr PetscReal tighter = 0.01, tightest = 1e-12;
 
@@ -28,8 +32,16 @@ constexpr PetscReal tighter = 0.01, tightest = 1e-12;
 constexpr const char *output_prefixes[] = {"-output",     "-progress", "-effects",       "-energy",
                                            "-checkpoint", "-restart",  "-error_estimate"};
 
+/// Ends of the names of PETSc's options that print or write, maybe to a file of the run itself.
+constexpr const char *viewer_ends[] = {"_view", "_view_pre", "_monitor", "_converged_reason"};
+
 bool is_output_option(const std::string &name)
 {
+  const auto ends = [&](const std::string &end) {
+    return name.size() > end.size() && name.compare(name.size() - end.size(), end.size(), end) == 0;
+  };
+  if (std::any_of(std::begin(viewer_ends), std::end(viewer_ends), ends) || name.find("_monitor_") != std::string::npos)
+    return true;
   return std::any_of(std::begin(output_prefixes), std::end(output_prefixes), [&](const std::string &prefix) {
     return name.compare(0, prefix.size(), prefix) == 0 && (name.size() == prefix.size() || name[prefix.size()] == '_');
   });
@@ -71,6 +83,24 @@ private:
   bool pushed_ = false;
 };
 
+/// Names and values of the database; unlike Options::all_given() with blanks and dashes in values as they are.
+PetscErrorCode given_options(const Options &options, std::vector<std::pair<std::string, std::string>> &list)
+{
+  std::vector<std::pair<std::string, std::string>> words;
+
+  PetscFunctionBeginUser;
+  PetscCall(options.all_given(words));
+  for (const auto &[name, printed] : words) {
+    char value[4096] = "";
+    PetscBool there;
+    PetscCall(PetscOptionsHasName(nullptr, nullptr, name.c_str(), &there)); // else a word of a value
+    if (!there) continue;
+    PetscCall(PetscOptionsGetString(nullptr, nullptr, name.c_str(), value, sizeof(value), nullptr));
+    list.emplace_back(name, value);
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 /// How many times larger the cells of @p other are than those of @p level.
 double cell_size_ratio(const ErrorLevel &level, const ErrorLevel &other)
 {
@@ -90,8 +120,10 @@ TimeError time_error(double fine, double twice, double four_times, int order)
 {
   const double near = fine - twice, far = twice - four_times;
   if (near == 0 || !(far / near > 0)) return {factor_of_safety * std::max(std::abs(near), std::abs(far)), {}};
-  const double observed = std::log2(far / near), used = std::clamp(observed, 0.5, double(order)),
-               safety = std::abs(observed - order) <= 0.1 * order ? factor_of_safety : doubtful_factor;
+  const double observed = std::log2(far / near);
+  const bool as_it_should = std::abs(observed - order) <= 0.1 * order;
+  const double used = as_it_should ? order : std::clamp(observed, 0.5, double(order)),
+               safety = as_it_should ? factor_of_safety : doubtful_factor;
   return {safety * std::abs(near) / (std::exp2(used) - 1), observed};
 }
 
@@ -203,7 +235,7 @@ PetscErrorCode ErrorEstimate::run_level(const Options &options, const Output &ou
 
   PetscFunctionBeginUser;
   PetscCall(PetscTime(&begin));
-  PetscCall(options.all_given(list));
+  PetscCall(given_options(options, list));
   list.erase(std::remove_if(list.begin(), list.end(), [](const auto &o) { return is_output_option(o.first); }),
              list.end());
   list.insert(list.end(), changes.begin(), changes.end()); // the last one counts
@@ -213,6 +245,7 @@ PetscErrorCode ErrorEstimate::run_level(const Options &options, const Output &ou
   Run run(registry_);
   PetscCall(run.declare());
   PetscCall(run.setup());
+  PetscCall(check_held(comm, run.scene(), run.model().composition()));
   Simulation &simulation = run.simulation();
   ProgressPrinter progress(comm, run.scene().facts());
   Sampling sampling;
@@ -249,18 +282,36 @@ PetscErrorCode describe_level(const Simulation &simulation, const Scene &scene, 
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+/// Ends the estimate unless @p other is another mesh of the same lung.
+PetscErrorCode ErrorEstimate::check_other_mesh(MPI_Comm comm, const ErrorLevel &run, const ErrorLevel &other) const
+{
+  const double ratio = cell_size_ratio(run, other);
+
+  PetscFunctionBeginUser;
+  PulmoUserCheck(std::abs(other.volume / run.volume - 1) < same_lung, comm,
+                 "-error_estimate: the %s holds %.4g ml at rest and the scene's %.4g ml: that is another lung",
+                 other.name.c_str(), other.volume, run.volume);
+  PulmoUserCheck(
+      std::max(ratio, 1 / ratio) >= least_ratio, comm,
+      "-error_estimate: the cells of the %s are %.3g times as large as the scene's; give one whose cells are "
+      "at least %.2g times larger or smaller",
+      other.name.c_str(), ratio, least_ratio);
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode ErrorEstimate::make(const Options &options, const Output &output, const Scene &scene,
                                    const Simulation &simulation, const std::vector<ClinicalEntry> &numbers,
                                    ErrorReport &report) const
 {
   const MPI_Comm comm = options.comm();
-  enum { fine, twice, four_times, tight, other, n_levels };
+  // the other mesh first: what is wrong with it is said before the rest is run
+  enum { fine, other, twice, four_times, tight, n_levels };
   std::array<Changes, n_levels> changes;
-  std::string mesh;
+  auto &levels = report.levels;
+  PetscInt count = 0;
 
   PetscFunctionBeginUser;
-  report.levels.assign(n_levels, {});
-  auto &levels = report.levels;
+  levels.assign(n_levels, {});
   PetscCall(describe_level(simulation, scene, levels[fine]));
   levels[fine].name = "the run itself";
   levels[fine].seconds = simulation.seconds().total;
@@ -269,23 +320,23 @@ PetscErrorCode ErrorEstimate::make(const Options &options, const Output &output,
   PetscCall(coarser_steps(simulation, 4, changes[four_times]));
   changes[tight] = changes[other] = changes[four_times];
   PetscCall(tighter_solver(simulation, changes[tight]));
-  PetscCall(other_mesh(changes[other], mesh));
+  PetscCall(other_mesh(changes[other], levels[other].name));
   levels[twice].name = "steps twice as long";
   levels[four_times].name = "steps 4 times as long";
-  levels[tight].name = "the same, tighter solver";
-  levels[other].name = "the same, " + mesh;
-  for (int i = twice; i < n_levels; ++i) {
-    PetscCall(PetscPrintf(comm, "\nError estimate, run %d of %d: %s\n", i, n_levels - 1, levels[i].name.c_str()));
+  levels[tight].name = "steps 4 times as long, tighter solver";
+  for (int i = other; i < n_levels; ++i) {
+    PetscCall(
+        PetscPrintf(comm, "\nError estimate, run %d of %d: %s\n", (int)++count, n_levels - 1, levels[i].name.c_str()));
     PetscCall(run_level(options, output, changes[i], levels[i]));
+    if (i == other) PetscCall(check_other_mesh(comm, levels[fine], levels[other]));
   }
-  PulmoUserCheck(std::abs(levels[other].volume / levels[fine].volume - 1) < same_lung, comm,
-                 "-error_estimate_mesh %s holds %.4g ml at rest and the scene's mesh %.4g ml: that is another lung",
-                 mesh_.c_str(), levels[other].volume, levels[fine].volume);
+  // phases may be shorter than the longer steps
+  const auto coarser = [&](int a, int b) { return levels[a].steps > least_coarsening * levels[b].steps; };
+  const bool longer = coarser(fine, twice) && coarser(twice, four_times);
+  if (!longer && levels[twice].failure.empty() && levels[four_times].failure.empty())
+    levels[twice].failure = "its steps are hardly longer, as the phases are too short for that: no error in time; a "
+                            "run with a smaller -ts_dt tells";
   const double ratio = cell_size_ratio(levels[fine], levels[other]);
-  PulmoUserCheck(std::max(ratio, 1 / ratio) >= least_ratio, comm,
-                 "-error_estimate_mesh %s has cells %.3g times as large as the scene's mesh; give one whose cells are "
-                 "at least %.2g times larger or smaller",
-                 mesh_.c_str(), ratio, least_ratio);
   for (std::size_t i = 0; i < numbers.size(); ++i) {
     if (!numbers[i].value) continue;
     ErrorBar bar;
@@ -293,13 +344,13 @@ PetscErrorCode ErrorEstimate::make(const Options &options, const Output &output,
     const auto short_steps = both(levels[fine], levels[twice], i),
                long_steps = both(levels[twice], levels[four_times], i),
                solver = both(levels[four_times], levels[tight], i), space = both(levels[four_times], levels[other], i);
-    if (short_steps && long_steps) {
+    if (longer && short_steps && long_steps) {
       const TimeError time =
           time_error(short_steps->first, short_steps->second, long_steps->second, simulation.scheme().order());
       bar.time = time.error;
       bar.time_order = time.order;
     }
-    if (solver) bar.solver = std::abs(solver->first - solver->second);
+    if (solver) bar.solver = 4 * std::abs(solver->first - solver->second); // what each step leaves may add up
     if (space) bar.space = space_error(space->first - space->second, ratio);
     report.bars.push_back(bar);
   }

@@ -90,25 +90,6 @@ PetscErrorCode keep_last_state(Checkpoint &checkpoint, const Simulation &simulat
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-/// Refuses a lung, or one of several bodies, that nothing holds in place.
-PetscErrorCode check_held(MPI_Comm comm, const Scene &scene, const Composition &composition)
-{
-  const std::vector<std::string> surfaces = composition.holding_surfaces();
-
-  PetscFunctionBeginUser;
-  PulmoUserCheck(
-      !surfaces.empty(), comm,
-      "nothing holds the lung in place: give -chest_wall (springs), or -support -support_rigid to let it move "
-      "freely but for the six rigid-body motions");
-  const bool everywhere = std::find(surfaces.begin(), surfaces.end(), "") != surfaces.end();
-  if (!everywhere)
-    PetscCall(scene.mesh().require_in_each_body(
-        surfaces,
-        "is held in place by nothing: name a surface of it with -chest_wall_surfaces or -support_surfaces, or "
-        "join the bodies in gmsh"));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
 /// Says when the run first left the range of the model: below J = 1 - Phi0 the porosity is negative, and no tissue law
 /// but berger keeps J from it.
 PetscErrorCode warn_of_no_air(MPI_Comm comm, const Scene &scene, const Simulation &simulation)
@@ -130,6 +111,24 @@ PetscErrorCode warn_of_no_air(MPI_Comm comm, const Scene &scene, const Simulatio
 }
 
 } // namespace
+
+PetscErrorCode check_held(MPI_Comm comm, const Scene &scene, const Composition &composition)
+{
+  const std::vector<std::string> surfaces = composition.holding_surfaces();
+
+  PetscFunctionBeginUser;
+  PulmoUserCheck(
+      !surfaces.empty(), comm,
+      "nothing holds the lung in place: give -chest_wall (springs), or -support -support_rigid to let it move "
+      "freely but for the six rigid-body motions");
+  const bool everywhere = std::find(surfaces.begin(), surfaces.end(), "") != surfaces.end();
+  if (!everywhere)
+    PetscCall(scene.mesh().require_in_each_body(
+        surfaces,
+        "is held in place by nothing: name a surface of it with -chest_wall_surfaces or -support_surfaces, or "
+        "join the bodies in gmsh"));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
 
 PetscErrorCode initialize()
 {
@@ -182,7 +181,7 @@ PetscErrorCode run(const Registry &registry, bool &finished)
   Output output;
   ErrorEstimate error_estimate(registry);
   Checkpoint checkpoint(options, output, scene, run.model(), simulation);
-  bool view_effects = false, audit_energy = true;
+  bool view_effects = false, audit_energy = true, asked_to_stop = false;
   PetscBool help, has_mesh;
 
   PetscFunctionBeginUser;
@@ -241,6 +240,7 @@ PetscErrorCode run(const Registry &registry, bool &finished)
     simulation.heed(signal);
     PetscCall(simulation.run(finished));
     if (simulation.stopped()) PetscCall(stop(checkpoint, simulation, signal.name()));
+    PetscCall(signal.asked(asked_to_stop)); // in the last step
   }
   PetscCall(options.warn_unused());
   PetscCall(warn_of_no_air(comm, scene, simulation));
@@ -257,7 +257,10 @@ PetscErrorCode run(const Registry &registry, bool &finished)
   PetscCall(signals.finish());
   PetscCall(write_summary(options, output, scene, run.model(), simulation, audits, true));
   PetscCall(print_numbers(comm, output, scene, simulation, audits));
-  if (error_estimate.in_use()) {
+  if (error_estimate.in_use() && (asked_to_stop || breath_rows(simulation.rows()).empty())) {
+    PetscCall(PetscPrintf(comm, "pulmo: warning: no error estimate: %s\n",
+                          asked_to_stop ? "the run was asked to stop" : "the run ends before its first breath"));
+  } else if (error_estimate.in_use()) {
     ErrorReport report;
     const auto numbers =
         clinical_entries(overall_numbers(regions.complete(simulation.rows())), scene.functional_residual_capacity());

@@ -32,6 +32,9 @@ constexpr int crawling_steps = 20;
 constexpr int max_border_solves = 8;
 constexpr PetscReal border_share = 0.1;
 
+/// No load leaves a residual as small as this, but rounding does.
+constexpr PetscReal rounding = 1e-13;
+
 /// Newton steps that a prescribed volume may ask for beyond PETSc's tests (rounding may keep it from being met).
 constexpr int max_extra_newton = 3;
 
@@ -292,7 +295,7 @@ PetscErrorCode Simulation::residual(PetscReal t, Vec X, Vec Xdot, Vec F)
   Measures measures;
 
   PetscFunctionBeginUser;
-  bordered_ = nullptr;
+  bordered_ = {};
   PetscCall(scatter(t, X, Xdot));
   PetscCall(model_.measure(local_, measures));
   if (!(measures.min_J_points > 0)) {
@@ -316,6 +319,7 @@ PetscErrorCode Simulation::border(SNES snes, Vec X, Vec Y)
   constexpr PetscReal share = 1e-4; // every term so far is linear in P: the difference quotient is then exact
   Vec F;
   KSP ksp;
+  KSPConvergedReason reason;
   PetscInt iterations;
   PetscReal P, along_y, along_z, here, there, change, norm, left;
 
@@ -339,7 +343,9 @@ PetscErrorCode Simulation::border(SNES snes, Vec X, Vec Y)
   PetscCall(model_.volume_derivative(local_, border_y_, along_y));
   PetscCall(VecZeroEntries(border_z_));
   for (int i = 0; i == 0 || (i < max_border_solves && std::abs(change) * left > border_share * norm); ++i) {
+    PetscCall(VecZeroEntries(border_x_)); // with -ksp_initial_guess_nonzero it is one
     PetscCall(KSPSolve(ksp, border_b_, border_x_));
+    PetscCall(KSPGetConvergedReason(ksp, &reason));
     PetscCall(KSPGetIterationNumber(ksp, &iterations));
     krylov_ += iterations;
     PetscCall(VecAXPY(border_z_, 1, border_x_));
@@ -349,18 +355,19 @@ PetscErrorCode Simulation::border(SNES snes, Vec X, Vec Y)
     PetscCall(DMGlobalToLocal(model_.dm(), border_z_, INSERT_VALUES, border_y_));
     PetscCall(model_.volume_derivative(local_, border_y_, along_z));
     change = airway_.change(here, (there - here) / dP, -along_y, -along_z);
+    if (reason < 0) break; // the step will be cut
   }
   PetscCall(VecAXPY(Y, change, border_z_));
   PetscCall(model_.set_airway_nodes(Y, -change)); // the new state is X - Y
-  bordered_ = F;
+  bordered_ = {Y, F};
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
 PetscErrorCode Simulation::product(Vec x, Vec y)
 {
   PetscFunctionBeginUser;
-  if (bordered_)
-    PetscCall(VecCopy(bordered_, y));
+  if (bordered_.step && x == bordered_.step)
+    PetscCall(VecCopy(bordered_.product, y));
   else
     PetscCall(reinterpret_cast<PetscErrorCode (*)(Mat, Vec, Vec)>(multiply_)(matrix_, x, y));
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -419,6 +426,7 @@ PetscErrorCode Simulation::after_stage()
   PetscCall(SNESGetConvergedReason(snes, &reason));
   newton_ += newton;
   krylov_ += krylov;
+  if (rows_.size() == 1 && newton == 0 && reason == SNES_CONVERGED_FNORM_ABS) PetscCall(warn_of_faint_load(snes));
   if (reason < 0) {
     PetscReal dt;
     PetscCall(TSGetTimeStep(ts_, &dt));
@@ -427,6 +435,23 @@ PetscErrorCode Simulation::after_stage()
     PetscCall(fail(dt, SNESConvergedReasons[reason], newton, inverted_measures_, inverted_, retry));
   }
   inverted_ = false;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Tolerances are absolute in units of the stiffest tangent: a load that is small beside it is taken for none.
+PetscErrorCode Simulation::warn_of_faint_load(SNES snes)
+{
+  PetscReal norm, tolerance;
+
+  PetscFunctionBeginUser;
+  PetscCall(SNESGetFunctionNorm(snes, &norm));
+  PetscCall(SNESGetTolerances(snes, &tolerance, nullptr, nullptr, nullptr, nullptr));
+  if (norm > rounding)
+    PetscCall(
+        PetscPrintf(options_.comm(),
+                    "pulmo: warning: the first step took no Newton step, as its residual %.2g is below -snes_atol "
+                    "%.2g; if this load is to move the lung, lower -snes_atol\n",
+                    (double)norm, (double)tolerance));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -65,6 +65,7 @@ PetscErrorCode matrix_product(Mat A, Vec x, Vec y)
 
   PetscFunctionBeginUser;
   PetscCall(PetscObjectQuery((PetscObject)A, owner, (PetscObject *)&container));
+  PetscCheck(container, PetscObjectComm((PetscObject)A), PETSC_ERR_SUP, "a copy of a bordered Jacobian");
   PetscCall(PetscContainerGetPointer(container, &simulation));
   PetscCall(static_cast<Simulation *>(simulation)->product(x, y));
   PetscFunctionReturn(PETSC_SUCCESS);

@@ -25,8 +25,8 @@ struct TimeError {
 TimeError time_error(double fine, double twice, double four_times, int order);
 
 /// Error in space from the difference @p difference to the same number on a mesh of cells @p ratio times as large
-/// (above or below 1). Of order 1, as rims and edges leave it, with a factor of safety of 1.25: 2.5 times the difference
-/// to a mesh refined once, 1.25 times that to one twice as coarse.
+/// (above or below 1). Of order 1, as rims and edges leave it, with a factor of safety of 1.25: 2.5 times the
+/// difference to a mesh refined once, 1.25 times that to one twice as coarse.
 double space_error(double difference, double ratio);
 
 /// A clinical number with what the discretisation makes it wrong by, each part in the number's unit. A part that could
@@ -83,6 +83,7 @@ private:
   PetscErrorCode coarser_steps(const Simulation &simulation, int factor, Changes &changes) const;
   PetscErrorCode tighter_solver(const Simulation &simulation, Changes &changes) const;
   PetscErrorCode other_mesh(Changes &changes, std::string &name) const;
+  PetscErrorCode check_other_mesh(MPI_Comm comm, const ErrorLevel &run, const ErrorLevel &other) const;
   PetscErrorCode run_level(const Options &options, const Output &output, const Changes &changes,
                            ErrorLevel &level) const;
 

@@ -33,6 +33,9 @@ private:
   Simulation simulation_;
 };
 
+/// Refuses a lung, or one of several bodies, that nothing holds in place.
+PetscErrorCode check_held(MPI_Comm comm, const Scene &scene, const Composition &composition);
+
 /// Runs the scene of the options database and writes its output. @p finished tells whether the run reached its
 /// end; user errors come back as PETSC_ERR_USER_INPUT, already printed.
 PetscErrorCode run(const Registry &registry, bool &finished);

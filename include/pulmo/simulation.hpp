@@ -129,6 +129,7 @@ private:
   PetscErrorCode keep_step(PetscReal dt);
   PetscErrorCode fail(PetscReal dt, const std::string &reason, PetscInt newton, const Measures &measures, bool inverted,
                       bool retry);
+  PetscErrorCode warn_of_faint_load(SNES snes);
   /// Notes an attempt that failed; ends the run if the next one would be too short.
   PetscErrorCode reject(PetscReal dt, const std::string &reason, PetscInt newton, const Measures &measures,
                         bool inverted);
@@ -160,14 +161,16 @@ private:
   PetscReal delivered_ = 0, worst_balance_ = 0, worst_reaction_ = 0, min_J_ = 1;
   PetscInt newton_ = 0, krylov_ = 0, rejected_ = 0;
   void (*multiply_)() = nullptr; ///< PETSc's product with matrix_
-  Vec bordered_ = nullptr;       ///< residual at the start of a bordered step, until the search along it begins
-  PetscReal start_norm_ = 0;     ///< residual of the attempt at hand before any Newton step and guess
-  int extra_newton_ = 0;         ///< Newton steps of the attempt at hand for the prescribed volume alone
-  bool inverted_ = false;        ///< the attempt at hand met J <= 0
-  bool cut_ = false;             ///< the step at hand was cut
-  bool resumed_ = false;         ///< the run goes on from what was read
-  bool stopped_ = false;         ///< by a signal
-  int crawled_ = 0;              ///< accepted steps in a row that were tiny
+  struct {
+    Vec step = nullptr, product = nullptr;
+  } bordered_;               ///< a bordered step and the residual at its start, until the search along it begins
+  PetscReal start_norm_ = 0; ///< residual of the attempt at hand before any Newton step and guess
+  int extra_newton_ = 0;     ///< Newton steps of the attempt at hand for the prescribed volume alone
+  bool inverted_ = false;    ///< the attempt at hand met J <= 0
+  bool cut_ = false;         ///< the step at hand was cut
+  bool resumed_ = false;     ///< the run goes on from what was read
+  bool stopped_ = false;     ///< by a signal
+  int crawled_ = 0;          ///< accepted steps in a row that were tiny
   Measures inverted_measures_;
   std::vector<FailedAttempt> failures_;
   StageSeconds seconds_;

@@ -1,6 +1,7 @@
 #!/usr/bin/python3
 """-error_estimate: error bars hold the numbers of a run far finer, on any number of ranks, and cost nothing of the run."""
 import os
+import shutil
 import unittest
 
 import pulmo_case as pc
@@ -14,8 +15,8 @@ STEPS = ["-ts_dt", "0.05"]
 ESTIMATE = ["-error_estimate"]
 BDF2 = ["-ts_type", "bdf"]
 NUMBERS = ["tidal_volume_ml", "peak_flow_ml_per_s", "peak_expiratory_flow_ml_per_s", "compliance_ml_per_cmH2O",
-           "resistance_cmH2O_s_per_l", "time_constant_s", "dynamic_compliance_ml_per_cmH2O", "work_j", "auto_peep_cmH2O",
-           "trapped_volume_ml"]
+           "resistance_cmH2O_s_per_l", "time_constant_s", "work_j", "auto_peep_cmH2O",
+           "trapped_volume_ml"]  # none is another one up to a factor
 
 
 def bars(case):
@@ -41,7 +42,7 @@ class ErrorEstimate(unittest.TestCase):
             with self.subTest(scheme=name):
                 print(f"\n{name}, 0.05 s, time:")
                 run = pc.finished(SCENE + STEPS + scheme + ESTIMATE)
-                self.assertGreaterEqual(self.bracketed(bars(run), fine, "time"), 9)
+                self.assertGreaterEqual(self.bracketed(bars(run), fine, "time"), 0.9 * len(NUMBERS))
 
     def test_bars_in_space(self):
         """Against cells a quarter of the size; steps are the same."""
@@ -49,7 +50,7 @@ class ErrorEstimate(unittest.TestCase):
         steps = ["-ts_dt", "0.2"]
         run = pc.finished(SCENE + steps + ESTIMATE)
         fine = pc.finished(SCENE + steps + ["-dm_refine", "2"])
-        self.assertGreaterEqual(self.bracketed(bars(run), fine, "space"), 9)
+        self.assertGreaterEqual(self.bracketed(bars(run), fine, "space"), 0.9 * len(NUMBERS))
 
     def test_levels_and_the_run_itself(self):
         plain = pc.finished(SCENE + STEPS)
@@ -59,12 +60,12 @@ class ErrorEstimate(unittest.TestCase):
             self.assertEqual(after[key], before[key])
             self.assertEqual(bars(with_bars)[key]["value"], before[key])
         levels = after["error_estimate"]["runs"]
-        self.assertEqual([level["dt_s"] for level in levels], [0.05, 0.1, 0.2, 0.2, 0.2])
-        self.assertEqual([level["cells"] for level in levels], [24, 24, 24, 24, 192])
+        self.assertEqual([level["dt_s"] for level in levels], [0.05, 0.2, 0.1, 0.2, 0.2])
+        self.assertEqual([level["cells"] for level in levels], [24, 192, 24, 24, 24])
         # a level is what its options give by hand
         by_hand = pc.finished(SCENE + ["-ts_dt", "0.2", "-dm_refine", "1"]).json()
         for key in NUMBERS:
-            self.assertAlmostEqual(levels[4]["numbers"][key], by_hand[key], delta=1e-9 * abs(by_hand[key]) + 1e-12)
+            self.assertAlmostEqual(levels[1]["numbers"][key], by_hand[key], delta=1e-9 * abs(by_hand[key]) + 1e-12)
         self.assertIn("± ", with_bars.out)
         self.assertEqual(plain.files(), with_bars.files())
 
@@ -73,7 +74,7 @@ class ErrorEstimate(unittest.TestCase):
         other = ["-error_estimate_mesh", pc.mesh("cube_coarse.msh")]
         fine = [pc.mesh("cube.msh") if o == pc.mesh("cube_coarse.msh") else o for o in SCENE]
         run = pc.finished(fine + STEPS + ESTIMATE + other).json()["error_estimate"]
-        self.assertEqual([run["runs"][i]["cells"] for i in (0, 4)], [192, 24])
+        self.assertEqual([run["runs"][i]["cells"] for i in (0, 1)], [192, 24])
         by_hand = [pc.finished(scene + ["-ts_dt", "0.2"]).json() for scene in (fine, SCENE)]
         for key in NUMBERS:
             difference = abs(by_hand[0][key] - by_hand[1][key])
@@ -81,7 +82,7 @@ class ErrorEstimate(unittest.TestCase):
 
     def test_refined_once_less(self):
         run = pc.finished(SCENE + ["-ts_dt", "0.2", "-dm_refine", "1"] + ESTIMATE).json()["error_estimate"]
-        self.assertEqual([run["runs"][i]["cells"] for i in (0, 4)], [192, 24])
+        self.assertEqual([run["runs"][i]["cells"] for i in (0, 1)], [192, 24])
 
     def test_ranks(self):
         one, two = (bars(pc.finished(SCENE + STEPS + ESTIMATE, ranks=n)) for n in (1, 2))
@@ -92,16 +93,50 @@ class ErrorEstimate(unittest.TestCase):
     def test_steps_by_their_error(self):
         run = pc.finished(SCENE + BDF2 + ["-step_volume_tolerance", "0.5", "-ts_adapt_dt_max", "0.1"] + ESTIMATE).json()
         steps = [level["steps"] for level in run["error_estimate"]["runs"]]
-        self.assertGreater(steps[0], 1.4 * steps[1])
-        self.assertGreater(steps[1], 1.2 * steps[2])
+        self.assertGreater(steps[0], 1.4 * steps[2])
+        self.assertGreater(steps[2], 1.2 * steps[3])
 
     def test_a_level_that_fails(self):
         """Newton steps that suffice for 0.05 s, not for 0.2 s: the run is whole, its bars are empty and say why."""
         case = pc.finished(SCENE + STEPS + ["-snes_max_it", "3", "-ts_adapt_dt_min", "0.051"] + ESTIMATE)
         levels = case.json()["error_estimate"]["runs"]
-        self.assertEqual(["failure" in level for level in levels], [False, False, True, True, True])
+        self.assertEqual(["failure" in level for level in levels], [False, True, False, True, True])
         self.assertIsNone(bars(case)["tidal_volume_ml"]["error"])
         self.assertIn("?: steps 4 times as long: no step could be accepted", case.out)
+
+    def test_steps_that_cannot_be_longer(self):
+        """Phases of one step: no error in time, and the reason."""
+        case = pc.finished(pc.LITRE + pc.DIRECT + pc.QUIET + pc.SCENE + ESTIMATE +
+                           ["-ventilator", "supersyringe", "-ventilator_inspiration", "0.2", "-ventilator_pause", "0.2",
+                            "-ts_dt", "0.2"])
+        self.assertIsNone(bars(case)["tidal_volume_ml"]["time"])
+        self.assertIn("hardly longer", case.out)
+
+    def test_no_breath(self):
+        case = pc.finished(SCENE + ["-ventilator_peep", "5", "-ts_max_time", "0.2"] + STEPS + ESTIMATE)
+        self.assertIn("ends before its first breath", case.out)
+        self.assertNotIn("error_estimate", case.json())
+
+    def test_names_and_viewers(self):
+        """A mesh whose name has blanks and dashes; a level leaves the run's own monitor alone."""
+        mesh = os.path.join(os.path.dirname(pc.scratch()), "a block  -v2.msh")
+        shutil.copy(pc.mesh("cube_coarse.msh"), mesh)
+        log = pc.scratch("newton.txt")
+        scene = [mesh if o == pc.mesh("cube_coarse.msh") else o for o in SCENE] + ["-ts_dt", "0.2", "-snes_monitor", "ascii:" + log]
+        lines = []
+        for more in ([], ESTIMATE):
+            pc.finished(scene + more)
+            with open(log) as f:
+                lines.append(f.read())
+        self.assertEqual(*lines)
+
+    def test_restart(self):
+        """Asked for at the restart only: the bars of the whole run."""
+        first = pc.finished(SCENE + STEPS + ["-checkpoint_every", "0.4"])
+        again = pc.finished(SCENE + STEPS + ESTIMATE + ["-restart", first.path("checkpoint_previous.h5")])
+        whole = bars(pc.finished(SCENE + STEPS + ESTIMATE))
+        for key in NUMBERS:
+            self.assertAlmostEqual(bars(again)[key]["error"], whole[key]["error"], delta=1e-6 * abs(whole[key]["value"]) + 1e-12)
 
     def test_refused(self):
         def said(options, *words):

@@ -614,6 +614,12 @@ class InputErrors(unittest.TestCase):
         self.assertEqual(len(warnings), 1, case.out)
         self.assertIn("-snes_mx_it was not used", warnings[0])
 
+    def test_a_load_below_the_tolerance_is_a_warning(self):
+        good = pulmo.LITRE + pulmo.DIRECT + pulmo.SCENE
+        for peak, warned in (("1e-9", True), ("1", False)):
+            case = pulmo.finished(good + ["-ts_max_time", "0.05", "-ventilator", "pcv", "-ventilator_pip", peak])
+            self.assertEqual("lower -snes_atol" in case.out, warned, case.out)
+
     def test_the_table_is_long_enough(self):
         self.assertGreaterEqual(len(self.table), 160)
 
