@@ -27,11 +27,6 @@ def kind(setting):
     return KINDS[setting.steps.scheme, bool(setting.steps.tolerance)]
 
 
-def doubt(errors):
-    """Uncertainty of a limit as a share of it; one that is not known is drawn as 100 %."""
-    return min(errors.doubt, 1)
-
-
 def legend_handles(settings):
     """One handle for each kind of steps among settings."""
     return [plt.Line2D([], [], lw=0, marker=marker, color=colour, label=label)
@@ -66,7 +61,6 @@ def costs(path, search):
             for run in runs:
                 if key in run.numbers:
                     point(axis, value(run), surely(search, run, [key]), run.setting, dark[run.setting.mesh.cells])
-            axis.axhspan(FLOOR, doubt(errors[key]), color="#eeeeee", zorder=0)
             logarithmic(axis)
             if key == shown[-1]:
                 axis.set_xlabel(label)
@@ -74,7 +68,7 @@ def costs(path, search):
         row[0].set_ylim(bottom=low / 2)
         row[0].set_ylabel(f"error of {short(key)}")
     axes[0][-1].legend(handles=legend_handles([r.setting for r in runs]), fontsize=7)
-    save(figure, path, "Error that cannot be excluded over cost (grey: below the reference's uncertainty; darker: finer mesh)")
+    save(figure, path, "Error that cannot be excluded over cost, the reference's uncertainty included (darker: finer mesh)")
 
 
 def ladders(path, search):
