@@ -324,6 +324,20 @@ class Tool(unittest.TestCase):
             self.assertEqual(list(csv.DictReader(f)), rows)
         self.assertEqual(re.search(r"\*\*V_T.*", (folder / "README.md").read_text())[0], re.search(r"\*\*V_T.*", text)[0])
 
+    def test_recommended_file_goes_after_the_flags(self):
+        """It says how the mesh is made and keeps to what the user's flags set of the solver."""
+        path = pathlib.Path(pulmo.scratch())
+        made, _ = Searching().explored(3000)
+        made.ladder.flags = ["-tube", "-ksp_rtol", "1e-3", "-ts_dt", "0.3"]
+        answer = next(a for a in made.answers() if a.run)
+        page.recommended(path, answer, made, "the command")
+        lines = path.read_text().splitlines()
+        self.assertIn("# Flags that go with it: -tube -ksp_rtol 1e-3 -ts_dt 0.3", lines)
+        self.assertIn(f"# The mesh: {answer.run.setting.mesh.cells} tetrahedra, given as {answer.run.setting.mesh.name}", lines)
+        self.assertIn(f"-ts_dt {answer.run.setting.steps.dt:.10g}", lines)
+        self.assertIn("-ksp_type fgmres", lines)
+        self.assertFalse([line for line in lines if line.startswith("-ksp_rtol")])
+
     def test_duplicate_levels_are_one(self):
         cube = pulmo.mesh("cube_lung.msh")
         made = command.prepare(["pcv", "--build", os.path.dirname(pulmo.PROGRAM), "--output", pulmo.scratch(), "--meshes", cube,

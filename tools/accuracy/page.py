@@ -7,7 +7,7 @@ from benchmarks.common import blas, markdown, processor, write_csv
 
 from . import fields, pictures
 from .numbers import file_name, percent, short
-from .settings import plain_options
+from .settings import names_of, plain_options
 
 FIGURES = {"ladders": pictures.ladders, "pareto": pictures.pareto, "costs": pictures.costs, "spectrum": pictures.digits}
 
@@ -51,19 +51,21 @@ def rows(search, found):
 
 
 def recommended(path, answer, search, command):
-    """An option file of a setting: to be read after the scene and before nothing else but what is the user's own."""
+    """An option file of a setting: to be read after the scene and the user's flags, as the run had them: what the flags set is not
+    taken from the solver file, mesh and steps are the setting's."""
     setting, run = answer.run.setting, answer.run
     choice = search.ladder.choice(setting, search.ladder.done[search.axes.base].numbers)
-    words = [*plain_options(setting.solver.file), *choice]
+    solver, given = plain_options(setting.solver.file), names_of(search.ladder.flags)
+    words = [*solver, *choice]
     demand = "; ".join(f"{short(k)} within {percent(s)}" for k, s in next(d for d in search.demands() if list(d) == answer.keys
                                                                          and max(d.values()) == answer.share).items())
     lines = [f"# {demand}: the cheapest setting that surely meets this, of those tried by", f"#   {command}",
              f"# {setting.name}", f"# {run.cpu:.3g} s CPU, {run.wall:.3g} s wall, {run.memory:.0f} MB on {processor()}",
              f"# The mesh: {origin(setting.mesh)}",
              "# Flags that go with it: " + (shlex.join(map(str, search.ladder.flags)) or "none"),
-             "# Give it after the scene's files and before these flags; options that follow it override it."]
+             "# Give it after the scene's files and these flags; options that follow it override it."]
     for i, word in enumerate(words):
-        if is_option(word):
+        if is_option(word) and not (i < len(solver) and word in given):
             value = words[i + 1] if i + 1 < len(words) and not is_option(words[i + 1]) else None
             lines.append(word if value is None else f"{word} {value}")
     path.write_text("\n".join(merged(lines)) + "\n")

@@ -84,25 +84,28 @@ class Setting:
         return f"{self.mesh.name} | {self.steps.name} | {self.solver.name}"
 
 
+def with_files(words):
+    """Words, each option file among them followed by the words that it holds."""
+    found = []
+    for before, word in zip([None, *words], words):
+        found.append(word)
+        if before == "-options_file" and Path(word).is_file():
+            found += with_files(plain_options(Path(word)))
+    return found
+
+
 def of_files(words, key, default=None):
     """Last value of an option among words and the option files that they name, as PETSc reads them."""
+    words = with_files(words)
     for word, value in zip(words, [*words[1:], None]):
-        if word == "-options_file" and value and Path(value).is_file():
-            default = of_files(plain_options(Path(value)), key, default)
-        elif word == key:
+        if word == key:
             default = value
     return default
 
 
 def names_of(words):
     """Names of all options among words and the option files that they name."""
-    found = set()
-    for word, value in zip(words, [*words[1:], None]):
-        if word == "-options_file" and value and Path(value).is_file():
-            found |= names_of(plain_options(Path(value)))
-        elif word.startswith("-"):
-            found.add(word)
-    return found
+    return {word for word in with_files(words) if word.startswith("-")}
 
 
 def refuse_ours(words):
