@@ -99,6 +99,13 @@ class Fields(unittest.TestCase):
         self.assertAlmostEqual(smaller["outside"], 0.1, delta=0.04)  # counted by points
         self.assertLess(smaller["u L2"], 1e-12)  # the same polynomial, extrapolated
 
+    def test_snapshots_of_another_time_are_none(self):
+        folder = pathlib.Path(pulmo.scratch())
+        folder.mkdir()
+        (folder / "fields.xdmf").write_text('<Time Value="0.5"/> fields.h5:/topology fields_000001.h5:/displacement')
+        self.assertIsNone(fields.read(folder, 0.55))
+        self.assertRaises(OSError, fields.read, folder, 0.50000001)  # this one is looked for
+
 
 class Known:
     """Stands for the program: numbers with known limits, errors and costs."""
