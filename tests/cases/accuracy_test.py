@@ -16,7 +16,8 @@ import case_meshes
 import pulmo_case as pulmo
 
 sys.path.insert(0, os.path.join(pulmo.SOURCE, "tools"))
-from accuracy import command, extrapolate, fields, ladder, numbers, page, pictures, search, settings  # noqa: E402
+from accuracy import (command, extrapolate, fields, ladder, manufactured, numbers, page, pictures, search, settings,  # noqa: E402
+                      sphere, truth)
 from accuracy.errors import Axes, estimate  # noqa: E402
 
 SCENE = ["-mesh_scale", "100", "-airflow_surfaces", "x1", "-chest_wall_surfaces", "x0,x1,y0,y1,z0,z1", "-ventilator_inspiration", "0.4",
@@ -98,6 +99,13 @@ class Fields(unittest.TestCase):
         self.assertAlmostEqual(smaller["outside"], 0.1, delta=0.04)  # counted by points
         self.assertLess(smaller["u L2"], 1e-12)  # the same polynomial, extrapolated
 
+    def test_snapshots_of_another_time_are_none(self):
+        folder = pathlib.Path(pulmo.scratch())
+        folder.mkdir()
+        (folder / "fields.xdmf").write_text('<Time Value="0.5"/> fields.h5:/topology fields_000001.h5:/displacement')
+        self.assertIsNone(fields.read(folder, 0.55))
+        self.assertRaises(OSError, fields.read, folder, 0.50000001)  # this one is looked for
+
 
 class Known:
     """Stands for the program: numbers with known limits, errors and costs."""
@@ -120,7 +128,7 @@ class Known:
         steps = 3 / float(options["-ts_dt"])
         cells = self.cells[options["-dm_plex_filename"]]
         spent = 1e-4 * steps * cells * (1.3 if options["-ts_type"] == "bdf" else 1)
-        values = {key: limit * (1 + self.true_error(words, key)) for key, limit in self.LIMITS.items()}
+        values = {key: limit * (1 + self.true_error(words, key)) for key, limit in self.LIMITS.items()} | {"peep_cmH2O": 0.0}
         failed = self.fails(options)
         failed, spent = failed or spent > timeout, min(spent, timeout)
         return {"code": int(failed), "reason": "it was to fail", "cpu": spent, "wall": spent, "memory": cells / 100, "kept": False,
@@ -129,18 +137,19 @@ class Known:
 
 
 class Searching(unittest.TestCase):
-    def explored(self, budget, asked=None, fails=None):
-        cells = {f"{n}.msh": n for n in (1000, 2500, 6000, 15000)}
+    def explored(self, budget, asked=None, fails=None, tetrahedra=(1000, 2500, 6000, 15000), tolerances=(), named=()):
+        cells = {f"{n}.msh": n for n in tetrahedra}
         options = argparse.Namespace(budget=budget, clock="wall", repeat=1, ranks=1, build=pathlib.Path("build"), output=pathlib.Path("nowhere"),
                                      results=pathlib.Path("nowhere"), schemes=["beuler", "bdf"], dt_factors=[4, 2, 1, 0.5, 0.25, 0.125],
-                                     adaptive=0, solvers=["iterative"], tolerances=[])
+                                     adaptive=0, solvers=["iterative"], tolerances=tolerances)
         meshes = [settings.Mesh(name, ("-dm_plex_filename", name), n) for name, n in cells.items()]
         steps, solvers = settings.steps(options, 0.05), settings.solvers(options)
         base = settings.Setting(meshes[0], next(t for t in steps if t.dt == 0.05), solvers[0])
         known = Known(cells, fails)
         with mock.patch.object(ladder.runs, "measured", known.measured), mock.patch("builtins.print"):
-            made = search.Search(ladder.Ladder(Axes(meshes, steps, solvers, base), [], [], options), list(Known.LIMITS), asked or {},
-                                 numbers.LEVELS)
+            made = search.Search(ladder.Ladder(Axes(meshes, steps, solvers, base), [], [], options),
+                                 list(asked or named or [*Known.LIMITS, "peep_cmH2O", "strain"]), asked or {}, numbers.LEVELS,
+                                 list(asked or named))
             made.explore()
         return made, known
 
@@ -186,6 +195,34 @@ class Searching(unittest.TestCase):
         self.assertIsNone(hopeless.answers()[0].run)
         self.assertIn("budget", hopeless.sentences()[0])
 
+    def test_what_is_not_examined_is_said(self):
+        made, _ = self.explored(3000, tetrahedra=[1000])
+        e = made.errors()["tidal_volume_ml"]
+        self.assertEqual(e.unexamined(), ["space", "solver"])
+        self.assertTrue(np.isfinite(e.uncertainty))
+        self.assertTrue(all("(space, solver not examined)" in text for text in made.sentences()), made.sentences())
+        self.assertEqual("\n".join(page.reference_table(made)).count(" not examined |"), 2 * 3)  # two numbers: space, solver, "in space"
+        asked, known = self.explored(3000, {"compliance_ml_per_cmH2O": 0.02}, tolerances=[1e-4, 1e-12])
+        self.assertEqual(asked.errors()["compliance_ml_per_cmH2O"].unexamined(), [])
+        self.assertEqual([s.solver.tolerance for s in asked.ladder.done if s.solver != asked.axes.base.solver], [1e-12])
+        self.assertNotIn("not examined", asked.sentences()[0])
+
+    def test_numbers_that_the_scene_lacks(self):
+        for key, said in (("strain", "has no strain; it has V_T, C_rs"), ("peep_cmH2O", "is 0")):
+            for words in ({"asked": {"tidal_volume_ml": 0.05, key: 0.01}}, {"named": [key]}):
+                with self.subTest(key=key, words=words), self.assertRaisesRegex(SystemExit, said):
+                    self.explored(100, **words)
+        made, _ = self.explored(100)
+        self.assertEqual((made.keys, made.dropped), (list(Known.LIMITS), ["peep_cmH2O", "strain"]))
+
+    def test_errors_that_cancel_are_no_accuracy_in_pictures(self):
+        made, _ = self.explored(3000)
+        for setting, run in made.ladder.done.items():
+            for key, e in made.errors().items():
+                drawn = pictures.surely(made, run, [key])
+                self.assertGreaterEqual(drawn, min(1, e.predicted(setting)))
+                self.assertLessEqual(drawn, pictures.surely(made, run))
+
     def test_failures_are_kept_apart(self):
         made, _ = self.explored(3000, fails=lambda options: float(options["-ts_dt"]) == 0.2)
         self.assertEqual({s.steps.dt for s in made.ladder.failed}, {0.2})
@@ -212,6 +249,43 @@ class Searching(unittest.TestCase):
             e = estimate(key, values, axes)
             self.assertGreater(e.shares["coupling"], 0)
             self.assertLessEqual(abs(e.value - 500), e.uncertainty)
+
+
+class Studies(unittest.TestCase):
+    def test_cost_at(self):
+        ladder_ = [(8.0, 1e-4), (1.0, 1e-1), (4.0, 1e-3), (2.0, 1e-2)]  # error 0.1 cost^-3.32
+        cost, bound = sphere.cost_at(ladder_, 10 ** -2.5)
+        self.assertAlmostEqual(cost, 2 ** 1.5)
+        self.assertFalse(bound)
+        self.assertEqual(sphere.cost_at(ladder_, 0.2), (1.0, True))      # cheaper may do, too
+        self.assertEqual(sphere.cost_at(ladder_, 1e-5), (None, False))
+        cost, _ = sphere.cost_at([(1, 1e-4), (2, 1e-1), (4, 1e-3)], 1e-2)  # falls below by luck first
+        self.assertAlmostEqual(cost, 2 * 2 ** 0.5)
+
+    def test_manufactured_is_read(self):
+        text = ("[ RUN      ] ManufacturedRun/0.DiscretisationError\n"
+                "  yoshihara cube_coarse J 0.87..1.36  u 2.460e-03  Grad u 9.320e-03  p 3.550e-02  Grad p 1.500e-01\n"
+                "  yoshihara cube        J 0.87..1.36  u 7.130e-04  Grad u 2.690e-03  p 9.820e-03  Grad p 8.050e-02  orders 1.79 1.79 1.85 0.90\n"
+                "[       OK ] ManufacturedRun/0.DiscretisationError (900 ms)\n"
+                "[ RUN      ] ManufacturedRun/0.OrderInTime\n"
+                "  backward Euler, yoshihara dt 1/8   J 0.98..1.20  u 7.300e-05  p 7.160e-04\n"
+                "  backward Euler, yoshihara dt 1/16  J 0.98..1.20  u 3.720e-05  p 3.640e-04  orders u 0.973 p 0.976\n"
+                "  BDF2, yoshihara dt 1/8   J 0.98..1.20  u 5.860e-06  p 5.750e-05\n"
+                "[       OK ] ManufacturedRun/0.OrderInTime (90 ms)\n")
+        ladders, formal = manufactured.read(text)
+        key = ("h, u and p of waves", "yoshihara", "Grad p")
+        self.assertEqual((ladders[key], formal[key]), ([(0.5, 0.15), (0.25, 0.0805)], 1))
+        key = ("Δt, backward Euler", "yoshihara", "u")
+        self.assertEqual((ladders[key], formal[key]), ([(1 / 8, 7.3e-5), (1 / 16, 3.72e-5)], 1))
+        key = ("Δt, BDF2", "yoshihara", "p")
+        self.assertEqual((ladders[key], formal[key]), ([(1 / 8, 5.75e-5)], 2))
+        self.assertEqual(len(ladders), 4 + 2 + 2)
+        self.assertRaisesRegex(SystemExit, "verification_mms", manufactured.read, "[ PASSED ] 0 tests.\n")
+
+    def test_radial_bdf2_has_order_two(self):
+        """Against Radau IIA of three stages, which shares the space but no formula in time."""
+        coarse, fine = (truth.bdf2_volume(dt) - truth.limit_volume() for dt in (0.025, 0.0125))
+        self.assertAlmostEqual(np.log2(coarse / fine), 2, delta=0.15)
 
 
 class Tool(unittest.TestCase):
@@ -257,6 +331,27 @@ class Tool(unittest.TestCase):
             self.assertEqual(list(csv.DictReader(f)), rows)
         self.assertEqual(re.search(r"\*\*V_T.*", (folder / "README.md").read_text())[0], re.search(r"\*\*V_T.*", text)[0])
 
+    def test_recommended_file_goes_after_the_flags(self):
+        """It says how the mesh is made and keeps to what the user's flags set of the solver."""
+        path = pathlib.Path(pulmo.scratch())
+        made, _ = Searching().explored(3000)
+        made.ladder.flags = ["-tube", "-ksp_rtol", "1e-3", "-ts_dt", "0.3"]
+        answer = next(a for a in made.answers() if a.run)
+        page.recommended(path, answer, made, "the command")
+        lines = path.read_text().splitlines()
+        self.assertIn("# Flags that go with it: -tube -ksp_rtol 1e-3 -ts_dt 0.3", lines)
+        self.assertIn(f"# The mesh: {answer.run.setting.mesh.cells} tetrahedra, given as {answer.run.setting.mesh.name}", lines)
+        self.assertIn(f"-ts_dt {answer.run.setting.steps.dt:.10g}", lines)
+        self.assertIn("-ksp_type fgmres", lines)
+        self.assertFalse([line for line in lines if line.startswith("-ksp_rtol")])
+
+    def test_duplicate_levels_are_one(self):
+        cube = pulmo.mesh("cube_lung.msh")
+        made = command.prepare(["pcv", "--build", os.path.dirname(pulmo.PROGRAM), "--output", pulmo.scratch(), "--meshes", cube,
+                                os.path.join(os.path.dirname(cube), ".", "cube_lung.msh"), "--refine", "1", "--dt-factors", "1", "2", "1", "--schemes",
+                                "bdf", "bdf", "--adaptive", "0", "--solvers", "direct", "direct", "--tolerances", "1e-4", "1e-4"]).axes
+        self.assertEqual([len(made.meshes), len(made.steps), len(made.solvers)], [2, 2, 2])
+
     def test_refuses(self):
         for arguments, named in ((["nowhere"], "nowhere"), (["pcv", "--question", "C_rs"], "C_rs=1%"), (["pcv", "--budget", "soon"], "soon"),
                                  (["pcv", "--meshes", "none.msh"], "none.msh"), (["pcv", "--solvers", "nothing"], "direct"),
@@ -267,6 +362,21 @@ class Tool(unittest.TestCase):
                 self.assertNotEqual(refused.returncode, 0)
                 self.assertIn(named, refused.stderr)
                 self.assertNotIn("Traceback", refused.stderr)
+
+    def test_refuses_levels_and_options_of_the_ladders(self):
+        folder = pathlib.Path(pulmo.scratch())
+        folder.mkdir()
+        cube, again, empty, options = pulmo.mesh("cube_lung.msh"), folder / "again.msh", folder / "empty.msh", folder / "mine.opts"
+        again.write_bytes(pathlib.Path(cube).read_bytes())
+        empty.write_text("$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n3\n1 0 0 0\n2 1 0 0\n3 0 1 0\n$EndNodes\n$Elements\n1\n"
+                         "1 2 2 1 1 1 2 3\n$EndElements\n")
+        options.write_text("-step_volume_tolerance 5 # ml\n")
+        for arguments, said in ((["pcv", "--", "-dm_refine", "1"], "use --refine"), ([options, "--meshes", cube], "-step_volume_tolerance"),
+                                (["pcv", "--", "-step_pressure_tolerance", "1"], "-step_pressure_tolerance"),
+                                (["pcv", "--", "-error_estimate"], "-error_estimate"), (["pcv", "--", "-restart", "there"], "-restart"),
+                                (["pcv", "--meshes", cube, again], "differ by 5 %"), (["pcv", "--meshes", empty], "no tetrahedra")):
+            with self.subTest(arguments=arguments), self.assertRaisesRegex(SystemExit, said):
+                command.prepare(["--build", os.path.dirname(pulmo.PROGRAM), "--output", str(folder), *map(str, arguments)])
 
 
 if __name__ == "__main__":

@@ -7,8 +7,9 @@
 Runs a scene with ladders of meshes, of time steps (backward Euler, BDF2, steps by their error) and of solver tolerances, each
 alone and then jointly, cheapest first, until the budget is used or the question is answered. Leaves in --output:
 README.md (answers, reference, all runs, pictures), accuracy.csv, and for each tolerance that is met an option file
-recommended_<p>percent.opts of the cheapest setting. Options of pulmo follow after --. A finished run with the same
-command, program and files is not repeated; its time counts for the budget all the same.
+recommended_<p>percent.opts of the cheapest setting. Options of pulmo follow after --, but not those that the ladders set
+(-dm_refine, -step_volume_tolerance, -step_pressure_tolerance) nor -error_estimate, -restart, -output_dir. A finished run with
+the same command, program and files is not repeated; its time counts for the budget all the same.
 
 Meshes: --meshes FILE ... (one body, coarse to fine), or --refine N (each mesh cut N times, nested), or the built-in pair of
 lungs at the sizes of --lung (the default if neither the scene nor the options after -- name a mesh).
@@ -25,7 +26,7 @@ from benchmarks.strategies import scene_file
 from . import page, settings
 from .errors import Axes
 from .ladder import Ladder
-from .numbers import ALIASES, LEVELS, question, short
+from .numbers import ALIASES, LEVELS, question
 from .search import Search
 
 UNITS = {"": 1, "s": 1, "min": 60, "h": 3600}
@@ -50,8 +51,8 @@ def parse(words):
     parser.add_argument("--question", action="append", default=[], metavar="NAME=1%",
                         help=f"a number and its tolerance (repeatable): {', '.join(ALIASES)} or a key of summary.json; the ladder ends "
                         "as soon as all are answered")
-    parser.add_argument("--numbers", nargs="+", default=list(ALIASES), metavar="NAME",
-                        help=f"without a question: the numbers that have to be met (default {' '.join(ALIASES)})")
+    parser.add_argument("--numbers", nargs="+", metavar="NAME", help="without a question: the numbers that have to be met (default: those of "
+                        f"{' '.join(ALIASES)} that the scene has)")
     parser.add_argument("--meshes", type=Path, nargs="+", help="meshes of one body, coarse to fine")
     parser.add_argument("--refine", type=int, default=None, metavar="N",
                         help="each mesh also cut in eight 1 ... N times (default: 1 if there is one mesh only, else 0)")
@@ -77,8 +78,10 @@ def parse(words):
         options.asked = dict(map(question, options.question))
     except ValueError as error:
         fail(str(error))
-    if "-output_dir" in options.flags:
-        fail("-output_dir is chosen by the tool; --output names the folder")
+    for name in ("lung", "dt_factors", "schemes", "solvers", "tolerances", "numbers"):
+        given = getattr(options, name)
+        setattr(options, name, given and list(dict.fromkeys(given)))
+    options.meshes = options.meshes and list({path.resolve(): path for path in options.meshes}.values())
     if min(options.repeat, options.ranks) < 1 or min(options.dt_factors) <= 0 or options.adaptive < 0 or (options.refine or 0) < 0:
         fail("--repeat and --ranks must be at least 1, --dt-factors positive, --adaptive and --refine not negative")
     return options
@@ -100,30 +103,28 @@ def axes(options, scene):
     return Axes(meshes, steps, solvers, settings.Setting(meshes[0], first, solvers[0])), spent
 
 
-def prepare(words):
-    """The search that the words of a command ask for; no run is made."""
+def prepare(words, origins=None):
+    """The search that the words of a command ask for; no run is made. origins: commands that made the given meshes, by path."""
     options = parse(words)
+    options.origins = origins or {}
     require(options.build, [])
     scene = [word for name in options.scene for word in ("-options_file", str(scene_file(name)))]
-    found, spent = axes(options, scene)
+    settings.refuse_ours([*scene, *options.flags])
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("tools/accuracy_cost: ended; finished runs are kept"))
-    keys = list(options.asked) or [ALIASES.get(name, name) for name in options.numbers]
+    found, spent = axes(options, scene)
+    named = list(options.asked) or [ALIASES.get(name, name) for name in options.numbers or []]
     ladder = Ladder(found, scene, options.flags, options, spent)
-    return Search(ladder, keys, options.asked, LEVELS)
+    return Search(ladder, named or list(ALIASES.values()), options.asked, LEVELS, named)
 
 
-def explore(words):
+def explore(words, origins=None):
     """Makes the runs that the words of a command ask for and writes its folder; the search and its sentences."""
-    search = prepare(words)
-    ladder = search.ladder
     try:
+        search = prepare(words, origins)
+        ladder = search.ladder
         search.explore()
     except KeyboardInterrupt:
         sys.exit("tools/accuracy_cost: interrupted; finished runs are kept")
-    base = ladder.done.get(search.axes.base)
-    unknown = [short(k) for k in search.asked if base and k not in base.numbers]
-    if unknown:
-        fail(f"the scene has no {', '.join(unknown)}; it has {', '.join(map(short, base.numbers))}")
     sentences = page.write(search, page.command_line(words))
     print("\n".join(sentences))
     print(f"{len(ladder.done) + len(ladder.failed)} runs, {ladder.new} of them new; {len(ladder.failed)} failed, {len(ladder.skipped)} left out")

@@ -4,6 +4,7 @@ The number of a setting (mesh m, steps t, solver s) is taken as Q* + e_m + e_t +
 with the base's steps, e_t with the steps on the base's mesh, e_s with the solvers on the base, each against the limit of
 its own ladder. What the parts do to one another is seen in the runs that vary two at once. Q* comes from the run with
 the smallest errors (the anchor) less its parts; its uncertainty is the sum of those of the ladders and of the coupling.
+A ladder of one level is not examined: its error is taken as 0 in the sums, and said to be missing wherever they are shown.
 """
 import math
 from dataclasses import dataclass, field
@@ -41,7 +42,7 @@ class Errors:
     key: str
     value: float = math.nan          # Q*
     uncertainty: float = math.inf
-    shares: dict = field(default_factory=dict)   # of the uncertainty: time, space, solver, coupling
+    shares: dict = field(default_factory=dict)   # of the uncertainty: time, space, solver, coupling; NaN: not examined
     limits: dict = field(default_factory=dict)
     parts: dict = field(default_factory=dict)
     anchor: Setting | None = None
@@ -49,9 +50,21 @@ class Errors:
     def known(self, setting):
         return all(part in self.parts for part in (setting.mesh, setting.steps, setting.solver))
 
+    def relative(self, part):
+        """|error| of a mesh, steps or solver alone as a share of the limit."""
+        return abs(self.parts[part] / self.value) if self.value else abs(self.parts[part])
+
+    def smallest(self, ladder):
+        """The smallest of these; infinite if no level of the ladder was run."""
+        return min((self.relative(part) for part in ladder if part in self.parts), default=math.inf)
+
     def single(self, setting):
         """|e_m|, |e_t|, |e_s| as shares of the value."""
-        return [abs(self.parts[part] / self.value) if self.value else 0 for part in (setting.mesh, setting.steps, setting.solver)]
+        return [self.relative(part) for part in (setting.mesh, setting.steps, setting.solver)]
+
+    def unexamined(self):
+        """Ladders of a single level: their error is not known and in no sum."""
+        return [name for name, share in self.shares.items() if math.isnan(share)]
 
     def predicted(self, setting):
         """Sum of the single errors' moduli: errors that happen to cancel do not count as accuracy."""
@@ -99,7 +112,7 @@ def in_time(values, axes):
 def in_space(values, axes):
     ladder = [(m.size(), values[s]) for m in axes.meshes if (s := Setting(m, axes.base.steps, axes.base.solver)) in values]
     if len(axes.meshes) == 1 and ladder:
-        return Limit(ladder[0][1], 0, None, 1, "one mesh given: not examined")
+        return Limit(ladder[0][1], math.nan, None, 1, "one mesh given: not examined")
     return limit(*zip(*ladder), 2)
 
 
@@ -109,7 +122,7 @@ def of_solver(values, axes):
             if (s := Setting(axes.base.mesh, axes.base.steps, t)) in values]
     base = values[axes.base]
     if not made:
-        return Limit(base, 0, None, 1, "not examined")
+        return Limit(base, math.nan, None, 1, "not examined")
     tight = min(made)[1]
     return Limit(tight, abs(tight - base) * 1e-2, None, 1, "the tightest tolerance")
 
@@ -149,5 +162,5 @@ def estimate(key, values, axes):
         coupling = 2 * abs(e_m * e_t / limit_alone) if limit_alone else 0
     errors.anchor = anchor
     errors.shares = {name: found.uncertainty for name, found in ladders.items()} | {"coupling": coupling}
-    errors.uncertainty = sum(errors.shares.values())
+    errors.uncertainty = sum(share for share in errors.shares.values() if not math.isnan(share))
     return errors

@@ -17,6 +17,7 @@ EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))  # of the nodes 4 to 9,
 INSIDE = -1e-9   # barycentric coordinates from here on are inside
 CHUNK = 200_000  # points that are worked on at a time
 NEAREST = (8, 64)  # centroids that are looked at, and for the points that are in none of these
+SAME = 1e-4        # s: snapshots that are further apart are of different times; fields.xdmf has six digits
 
 
 @dataclass(frozen=True)
@@ -36,8 +37,10 @@ def snapshots(folder):
 
 
 def read(folder, time):
-    """The snapshot of a run nearest to a time."""
-    _, values, mesh = min(snapshots(folder), key=lambda s: abs(s[0] - time))
+    """The snapshot of a run at a time; None if it left none there."""
+    at, values, mesh = min(snapshots(folder), key=lambda s: abs(s[0] - time))
+    if abs(at - time) > SAME:
+        return None
     with h5py.File(mesh) as file:
         points, cells = file["geometry"][:], file["topology"][:].reshape(-1, 10)
     with h5py.File(values) as file:

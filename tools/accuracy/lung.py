@@ -22,7 +22,8 @@ def fine_setting(search, results):
 
 
 def in_steps(words, sizes):
-    """Rows of C_rs on the coarsest mesh: scheme, then one column for each size; and a sentence on the limits."""
+    """Rows of C_rs on the coarsest mesh: scheme, then one column for each size; a sentence on the limits; and the relative error of
+    the far finer run's steps."""
     search, rows = command.prepare(words), []
     base, key = search.axes.base, ALIASES["C_rs"]
     search.ladder.budget = math.inf
@@ -32,7 +33,9 @@ def in_steps(words, sizes):
         rows.append([SCHEMES[scheme], *(f"{v:.3f}" for v in values)])
     limits, chosen = in_time(search.ladder.values(key), search.axes)
     told = "; ".join(f"{SCHEMES[s]} {found.value:.3f} ± {found.uncertainty:.3f} ({found.how})" for s, found in limits.items())
-    return rows, f"Limits: {told}. Taken: {chosen.value:.3f} ± {chosen.uncertainty:.3f}."
+    fine = search.ladder.done.get(Setting(base.mesh, FINE_STEPS, base.solver))
+    return (rows, f"Limits: {told}. Taken: {chosen.value:.3f} ± {chosen.uncertainty:.3f}.",
+            fine.numbers[key] / chosen.value - 1 if fine else math.nan)
 
 
 def run(folder, results, build):
@@ -55,13 +58,21 @@ def run(folder, results, build):
         rows.append([name, f"{r.cpu:.1f}", f"{r.numbers[key]:.3f}", f"{off[key]:+.2f}", f"{100 * e.of(r.numbers[key]):+.2f}",
                      f"{100 * e.doubt:.2f}", *(f"{off[k]:+.2f}" for k in ALIASES.values() if k != key and SHORT[k] != "PIP")])
     write_csv(folder / "check.csv", header, rows)
+    ramp, ramp_limits, in_time_part = in_steps([*QUESTION, *places, "--", *FLAGS], SIZES)
+    jump, jump_limits, _ = in_steps([*QUESTION, *places], SIZES[:3])
+    # the finest mesh of the ladder, its error taken to fall with h^2
+    near = max((m for m in search.axes.meshes if m in e.parts), key=lambda m: m.cells)
+    in_space_part = e.parts[near] / e.value * (setting.mesh.size() / near.size()) ** 2
+    off = e.of(fine.numbers[key])
     lines = ["# The answer against a far finer run", "", "    tools/accuracy_study lung", "", *(f"- {text}" for text in sentences), "",
              f"The answer took {spent:.0f} s of CPU on one core, meshes included (CPU, since the machine had other work). "
              f"The check: {setting.name}, {fine.summary['cells']} tetrahedra, {fine.summary['dofs']} dofs, {fine.summary['steps']} steps, "
              f"{fine.cpu:.0f} s CPU; C_rs {fine.numbers[key]:.3f} ml/cmH2O, the tool's limit from the runs below is {e.value:.3f} ± "
-             f"{e.uncertainty:.2f}.", "", *markdown(header, rows), ""]
-    ramp, ramp_limits = in_steps([*QUESTION, *places, "--", *FLAGS], SIZES)
-    jump, jump_limits = in_steps([*QUESTION, *places], SIZES[:3])
+             f"{e.uncertainty:.2f}.", "",
+             f"So the finer run lies {100 * off:+.2f} % from the limit, {'inside' if abs(off) <= e.doubt else '**outside**'} its ± "
+             f"{100 * e.doubt:.2f} %. It has errors of its own: about {100 * in_time_part:+.2f} % in time ({FINE_STEPS.name}, the first table "
+             f"below) and {100 * in_space_part:+.2f} % in space (that of {near.name}, falling with h²). \"Off by\" is against that run, "
+             "\"estimated\" against the limit.", "", *markdown(header, rows), ""]
     base = search.axes.base.mesh
     lines += ["## C_rs over Δt", "", f"ml/cmH2O, {base.cells} tetrahedra, pressure let go over 0.1 s:", "",
               *markdown(["scheme", *(f"{dt:g} s" for dt in SIZES)], ramp), "", ramp_limits, "",

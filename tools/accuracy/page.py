@@ -7,14 +7,14 @@ from benchmarks.common import blas, markdown, processor, write_csv
 
 from . import fields, pictures
 from .numbers import file_name, percent, short
-from .settings import plain_options
+from .settings import names_of, plain_options
 
 FIGURES = {"ladders": pictures.ladders, "pareto": pictures.pareto, "costs": pictures.costs, "spectrum": pictures.digits}
 
 
 def field_errors(search):
-    """Errors of the fields by setting against the run with the smallest errors, at the snapshot with the most gas; and that
-    run, None if there are no snapshots."""
+    """Errors of the fields by setting against the run with the smallest errors, at the snapshot with the most gas (runs without one
+    at that time are left out); and that run, None if there are no snapshots."""
     done = search.ladder.done
     errors = search.errors()
     if not errors or any(not (run.folder / "fields.xdmf").exists() for run in done.values()):
@@ -24,8 +24,8 @@ def field_errors(search):
     times = [time for time, *_ in fields.snapshots(reference.folder)]
     time = max(times, key=lambda t: volumes[min(volumes, key=lambda row: abs(row - t))][0])
     compare = fields.Comparison(fields.read(reference.folder, time))
-    found = {setting: compare(fields.read(run.folder, time)) for setting, run in done.items() if run is not reference}
-    return found, (reference, time)
+    made = {setting: fields.read(run.folder, time) for setting, run in done.items() if run is not reference}
+    return {setting: compare(snapshot) for setting, snapshot in made.items() if snapshot}, (reference, time)
 
 
 def rows(search, found):
@@ -51,20 +51,31 @@ def rows(search, found):
 
 
 def recommended(path, answer, search, command):
-    """An option file of a setting: to be read after the scene and before nothing else but what is the user's own."""
+    """An option file of a setting: to be read after the scene and the user's flags, as the run had them: what the flags set is not
+    taken from the solver file, mesh and steps are the setting's."""
     setting, run = answer.run.setting, answer.run
     choice = search.ladder.choice(setting, search.ladder.done[search.axes.base].numbers)
-    words = [*plain_options(setting.solver.file), *choice]
+    solver, given = plain_options(setting.solver.file), names_of(search.ladder.flags)
+    words = [*solver, *choice]
     demand = "; ".join(f"{short(k)} within {percent(s)}" for k, s in next(d for d in search.demands() if list(d) == answer.keys
                                                                          and max(d.values()) == answer.share).items())
     lines = [f"# {demand}: the cheapest setting that surely meets this, of those tried by", f"#   {command}",
              f"# {setting.name}", f"# {run.cpu:.3g} s CPU, {run.wall:.3g} s wall, {run.memory:.0f} MB on {processor()}",
-             "# Give it after the scene's files; options that follow it override it."]
+             f"# The mesh: {origin(setting.mesh)}",
+             "# Flags that go with it: " + (shlex.join(map(str, search.ladder.flags)) or "none"),
+             "# Give it after the scene's files and these flags; options that follow it override it."]
     for i, word in enumerate(words):
-        if is_option(word):
+        if is_option(word) and not (i < len(solver) and word in given):
             value = words[i + 1] if i + 1 < len(words) and not is_option(words[i + 1]) else None
             lines.append(word if value is None else f"{word} {value}")
     path.write_text("\n".join(merged(lines)) + "\n")
+
+
+def origin(mesh):
+    """Where a mesh comes from, in words."""
+    if mesh.origin:
+        return mesh.origin
+    return f"{mesh.cells} tetrahedra, " + (f"given as {mesh.words[1]}" if "-dm_plex_filename" in mesh.words else "that of the scene or of the flags")
 
 
 def is_option(word):
@@ -82,7 +93,17 @@ def number(value, digits=5):
 
 
 def share(value):
-    return "-" if not math.isfinite(value) else f"{100 * value:.2g} %"
+    if math.isnan(value):
+        return "not examined"
+    return f"{100 * value:.2g} %" if math.isfinite(value) else "-"
+
+
+def anchors(search):
+    """Runs that the limits of the asked numbers were taken from, in words."""
+    by_run = {}
+    for key, e in search.errors().items():
+        by_run.setdefault(e.anchor.name, []).append(short(key))
+    return "; ".join(f"{name} ({', '.join(keys)})" for name, keys in by_run.items())
 
 
 def reference_table(search):
@@ -144,11 +165,12 @@ def write(search, command):
                + (f", {benchmark_runs.load_range([r for run in ladder.done.values() for r in run.results])}" if ladder.done else ""))
     lines = ["# What accuracy costs", "", f"    {command}", "", *(f"- {text}" for text in sentences), "",
              f"{machine}. {ladder.spent:.0f} s of a budget of {ladder.budget:.0f} s ({options.clock} time).", "",
+             *([f"Not defined or 0 in this scene, hence left out: {', '.join(map(short, search.dropped))}.", ""] if search.dropped else []),
              "## The reference", ""]
     if ladder.done:
         lines += [*reference_table(search), "",
                   "Limit: Richardson's extrapolation of each ladder (observed order; Celik et al. 2008), the parts of time, space and solver "
-                  f"taken off the numbers of {next(iter(search.all_errors().values())).anchor.name}. ±: sum of what the ladders' "
+                  f"taken off the numbers of {anchors(search)}. ±: sum of what the ladders' "
                   "limits may be off and of the coupling between time and space that the joint runs show. It bounds what the ladders can see; an error common to all their levels (the shape of "
                   "a mesh that is refined without following the body) is not among it.", "", "## Runs", "",
                   "Errors in per cent of the limit, in brackets where they are below its uncertainty.", "", *run_table(search, found), ""]

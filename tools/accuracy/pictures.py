@@ -27,21 +27,16 @@ def kind(setting):
     return KINDS[setting.steps.scheme, bool(setting.steps.tolerance)]
 
 
-def doubt(errors):
-    """Uncertainty of a limit as a share of it; one that is not known is drawn as 100 %."""
-    return min(errors.doubt, 1)
-
-
 def legend_handles(settings):
     """One handle for each kind of steps among settings."""
     return [plt.Line2D([], [], lw=0, marker=marker, color=colour, label=label)
             for label, marker, colour in dict.fromkeys(map(kind, settings))]
 
 
-def point(axis, x, error, unsure, setting, shade=1.0):
-    """An error; hollow at the reference's uncertainty where it is below that."""
+def point(axis, x, error, setting, shade=1.0):
+    """An error that cannot be excluded."""
     _, marker, colour = kind(setting)
-    axis.plot(x, max(error, unsure, FLOOR), marker=marker, color=colour, ms=5, alpha=shade, mfc="none" if error <= unsure else colour)
+    axis.plot(x, max(error, FLOOR), marker=marker, color=colour, ms=5, alpha=shade)
 
 
 def shades(runs):
@@ -51,7 +46,7 @@ def shades(runs):
 
 
 def costs(path, search):
-    """Error of each asked number over seconds, dofs and memory."""
+    """Error that cannot be excluded of each asked number over seconds, dofs and memory."""
     runs, errors = list(search.ladder.done.values()), search.errors()
     clock = search.ladder.options.clock
     shown = [key for key in errors if max((abs(errors[key].of(r.numbers[key])) for r in runs if key in r.numbers), default=0) > 1e-7]
@@ -65,17 +60,15 @@ def costs(path, search):
         for axis, (label, value) in zip(row, columns):
             for run in runs:
                 if key in run.numbers:
-                    point(axis, value(run), abs(errors[key].of(run.numbers[key])), doubt(errors[key]), run.setting,
-                          dark[run.setting.mesh.cells])
-            axis.axhspan(FLOOR, doubt(errors[key]), color="#eeeeee", zorder=0)
+                    point(axis, value(run), surely(search, run, [key]), run.setting, dark[run.setting.mesh.cells])
             logarithmic(axis)
             if key == shown[-1]:
                 axis.set_xlabel(label)
-        low = min(max(abs(errors[key].of(r.numbers[key])), doubt(errors[key]), FLOOR) for r in runs if key in r.numbers)
+        low = min(max(surely(search, r, [key]), FLOOR) for r in runs if key in r.numbers)
         row[0].set_ylim(bottom=low / 2)
         row[0].set_ylabel(f"error of {short(key)}")
     axes[0][-1].legend(handles=legend_handles([r.setting for r in runs]), fontsize=7)
-    save(figure, path, "Error over cost (grey: below the reference's uncertainty; hollow: shown at it; darker: finer mesh)")
+    save(figure, path, "Error that cannot be excluded over cost, the reference's uncertainty included (darker: finer mesh)")
 
 
 def ladders(path, search):
@@ -98,8 +91,11 @@ def ladders(path, search):
         column[0].axhspan(FLOOR, np.clip(e.shares["time"] / abs(e.value), FLOOR, 1), color="#eeeeee", zorder=0)
         logarithmic(column[0], xlabel="steps", title=short(key))
         points = sorted((m.cells, max(abs(e.parts[m] / e.value), FLOOR)) for m in axes_.meshes if m in e.parts)
-        column[1].plot(*zip(*points), marker="D", ms=4, lw=0.8, color="#3b7d4f")
-        column[1].axhspan(FLOOR, np.clip(e.shares["space"] / abs(e.value), FLOOR, 1), color="#eeeeee", zorder=0)
+        if "space" in e.unexamined():
+            column[1].text(0.5, 0.5, "not examined", ha="center", transform=column[1].transAxes, fontsize=8)
+        else:
+            column[1].plot(*zip(*points), marker="D", ms=4, lw=0.8, color="#3b7d4f")
+            column[1].axhspan(FLOOR, np.clip(e.shares["space"] / abs(e.value), FLOOR, 1), color="#eeeeee", zorder=0)
         logarithmic(column[1], xlabel="tetrahedra")
         for axis in column:
             drawn = [y for line in axis.lines for y in line.get_ydata()]
@@ -108,12 +104,6 @@ def ladders(path, search):
     axes[1][0].set_ylabel("error in space")
     axes[0][0].legend(fontsize=7)
     save(figure, path, "Each ladder alone, against its own limit (grey: the limit's uncertainty)")
-
-
-def worst(search, run):
-    """Largest relative error of the asked numbers, and the doubt that goes with it."""
-    errors = search.errors()
-    return max(((abs(e.of(run.numbers[k])), doubt(e)) for k, e in errors.items() if k in run.numbers), default=(np.nan, np.nan))
 
 
 def front(points):
@@ -126,9 +116,10 @@ def front(points):
     return found
 
 
-def surely(search, run):
-    """The largest error that a run may have in an asked number: what the recommendations go by; 100 % at most."""
-    return min(1, search.worst(run, dict.fromkeys(search.errors(), 1.0)))
+def surely(search, run, keys=None):
+    """The largest error that a run may have in the numbers `keys` (default: all that are asked), by the sum of its single errors:
+    what the recommendations go by; 100 % at most."""
+    return min(1, search.worst(run, dict.fromkeys(keys or search.errors(), 1.0)))
 
 
 def pareto(path, search):
@@ -137,7 +128,7 @@ def pareto(path, search):
     figure, axis = plt.subplots(figsize=(7, 4.6), layout="constrained")
     dark = shades(runs)
     for run in runs:
-        point(axis, search.ladder.seconds(run), surely(search, run), 0, run.setting, dark[run.setting.mesh.cells])
+        point(axis, search.ladder.seconds(run), surely(search, run), run.setting, dark[run.setting.mesh.cells])
     line = front([(search.ladder.seconds(r), surely(search, r), r) for r in runs])
     axis.step([p[0] for p in line], [p[1] for p in line], where="post", color="#555555", lw=0.8)
     for answer in search.answers():
@@ -152,12 +143,12 @@ def pareto(path, search):
 
 
 def digits(path, search):
-    """Time-Accuracy-Size spectrum (Chang, Fabien, Knepley & Mills 2018) of the largest error of the asked numbers."""
+    """Time-Accuracy-Size spectrum (Chang, Fabien, Knepley & Mills 2018) of the error of the asked numbers that cannot be excluded."""
     runs = list(search.ladder.done.values())
     figure, axes = plt.subplots(1, 4, figsize=(14, 3.6), layout="constrained")
     dark = shades(runs)
     for run in runs:
-        error, seconds, dofs = max(max(worst(search, run)), FLOOR), search.ladder.seconds(run), run.summary["dofs"]
+        error, seconds, dofs = max(surely(search, run), FLOOR), search.ladder.seconds(run), run.summary["dofs"]
         _, marker, colour = kind(run.setting)
         for axis, x, y in ((axes[0], np.log10(dofs), -np.log10(error)), (axes[1], np.log10(dofs), dofs / seconds),
                            (axes[2], np.log10(dofs), -np.log10(error * seconds)), (axes[3], seconds, -np.log10(error * seconds))):

@@ -2,9 +2,11 @@
 import math
 from dataclasses import dataclass
 
-from .errors import estimate
+from benchmarks.common import fail
+
+from .errors import LOOSE, estimate
 from .numbers import percent, short
-from .settings import ORDERS
+from .settings import ORDERS, Setting
 
 SPACE = 1 / 4     # a mesh comes before steps that cost as much: there are fewer, and fewer than three tell little
 SINGLES = 2 / 3   # share of the budget that the ladders alone may take before joint runs had their turn
@@ -23,11 +25,13 @@ class Answer:
 
 
 class Search:
-    """Makes the runs of a ladder. asked: key -> share of a question; without one the default numbers at the default levels."""
+    """Makes the runs of a ladder. asked: key -> share of a question; without one the numbers `keys` at the default levels.
+    named: keys that the user gave; the others are dropped where the scene does not have them."""
 
-    def __init__(self, ladder, keys, asked, levels):
+    def __init__(self, ladder, keys, asked, levels, named=()):
         self.ladder, self.axes = ladder, ladder.axes
-        self.keys, self.asked, self.levels = keys, asked, levels
+        self.keys, self.asked, self.levels, self.named = keys, asked, levels, named
+        self.dropped = []
         self._errors = (None, {})
 
     # ------------------------------------------------------------ what is known
@@ -82,7 +86,7 @@ class Search:
         return min(met, key=self.cost, default=None)
 
     def enough(self):
-        """Whether all limits stand on three levels, or on all that there are: two show no order."""
+        """Whether the limits in space and time stand on three levels, or on all that there are: two show no order."""
         a = self.axes
         least = {"space": min(EVIDENCE, len(a.meshes)),
                  "time": min(EVIDENCE, max(sum(t.scheme == s and not t.tolerance for t in a.steps) for s in ORDERS))}
@@ -107,7 +111,9 @@ class Search:
         """Makes the runs."""
         if not self.ladder.attempt(self.axes.base):
             return
+        self.check_numbers()
         if self.asked:
+            self.tighten()
             self.solve()
             return
         self.singles(SINGLES * self.ladder.budget)
@@ -115,6 +121,26 @@ class Search:
             self.close_in(demand)
         self.joints()
         self.singles(self.ladder.budget)
+
+    def check_numbers(self):
+        """Ends the program if a number that the user named is none of the base run's or 0 there; drops defaults that are."""
+        numbers = self.ladder.done[self.axes.base].numbers
+        usable = ", ".join(short(k) for k, value in numbers.items() if value)
+        if unknown := [short(k) for k in self.named if k not in numbers]:
+            fail(f"the scene has no {', '.join(unknown)}; it has {usable}")
+        if zero := [short(k) for k in self.named if not numbers[k]]:
+            fail(f"{', '.join(zero)} is 0 in this scene and has no relative error; ask for one of {usable}")
+        self.dropped = [k for k in self.keys if not numbers.get(k)]
+        self.keys = [k for k in self.keys if k not in self.dropped]
+        if not self.keys:
+            fail(f"the scene has none of the default numbers; name some with --numbers: it has {usable}")
+
+    def tighten(self):
+        """Runs the base with the tightest solver tolerance, so that the solver's part is known."""
+        base = self.axes.base
+        tight = min((s for s in self.axes.solvers if s.tolerance < LOOSE), key=lambda s: s.tolerance, default=None)
+        if tight and self.ladder.fits(setting := Setting(base.mesh, base.steps, tight)):
+            self.ladder.attempt(setting)
 
     def untried(self, settings):
         rest = (s for s in settings if s not in self.ladder.done and s not in self.ladder.failed)
@@ -181,7 +207,7 @@ class Search:
                 if name != "solver" and e.limits[name].levels < EVIDENCE:
                     found.append(setting)
                     break
-                good = min((abs(e.parts[part] / e.value) for part in ladder if part in e.parts), default=math.inf)
+                good = e.smallest(ladder)
                 if e.shares[name] > 0.15 * share * abs(e.value) or good > 0.4 * share or e.shares["coupling"] > 0.2 * share * abs(e.value):
                     found.append(setting)
                     break
@@ -201,14 +227,19 @@ class Search:
                 texts.append(f"**{question}**: {run.setting.name}; {run.cpu:.3g} s CPU, {run.wall:.3g} s wall, {run.memory:.0f} MB. "
                              f"Error with the reference's uncertainty at most "
                              + ", ".join(f"{short(k)} {100 * self.errors()[k].worst(run.setting, run.numbers[k]):.2g} %"
-                                         for k in demand if k in run.numbers) + ".")
+                                         for k in demand if k in run.numbers) + self.missing() + ".")
             elif answer.expected:
                 texts.append(f"**{question}**: no run meets it within the budget; {answer.expected.name} promises to "
-                             f"(about {answer.seconds:.3g} s).")
+                             f"(about {answer.seconds:.3g} s){self.missing()}.")
             else:
                 texts.append(f"**{question}**: nothing within the budget meets or promises it; a larger --budget or finer levels "
                              "are needed. " + self.obstacle(demand))
         return texts
+
+    def missing(self):
+        """Says which ladders no error was taken of."""
+        names = dict.fromkeys(name for e in self.errors().values() for name in e.unexamined())
+        return f" ({', '.join(names)} not examined)" if names else ""
 
     def obstacle(self, demand):
         """What stands in the way, of the number that is furthest off."""
@@ -219,9 +250,10 @@ class Search:
                 continue
             e = self.errors()[key]
             parts = {"the uncertainty of the limit": e.doubt}
-            for name, ladder in (("the smallest error in space", self.axes.meshes), ("the smallest error in time", self.axes.steps)):
-                parts[name] = min((abs(e.parts[p] / e.value) for p in ladder if p in e.parts), default=math.inf)
+            for name, ladder in (("space", self.axes.meshes), ("time", self.axes.steps)):
+                if name not in e.unexamined():
+                    parts[f"the smallest error in {name}"] = e.smallest(ladder)
             name = max(parts, key=parts.get)
             size = f"{100 * parts[name]:.2g} %" if math.isfinite(parts[name]) else "not known: one level alone was run"
             worst.append((sum(parts.values()) / share, f"Furthest off is {short(key)}: {name} is {size}"))
-        return max(worst)[1] + "."
+        return max(worst)[1] + self.missing() + "."

@@ -15,18 +15,28 @@ import meshio
 
 from benchmarks.common import SOLVERS, SOURCE, fail
 
+from .numbers import percent
+
 ADAPTIVE = 1e-2     # largest error that a step may make in the ladder of adaptive steps, of V_T and PIP
 SCHEMES = {"beuler": "backward Euler", "bdf": "BDF2"}
 ORDERS = {"beuler": 1, "bdf": 2}
 AIRWAY = 5          # size of the lung's cells over that of the airway's (tools/lung_mesh: 15 and 3 mm)
+ALIKE = 1.05        # meshes whose numbers of cells differ by less than this factor are no two levels
+OURS = {"-dm_refine": "the ladder in space refines meshes itself; use --refine",
+        "-step_volume_tolerance": "the ladder in time chooses the steps; use --adaptive",
+        "-step_pressure_tolerance": "the ladder in time chooses the steps; use --adaptive",
+        "-error_estimate": "it makes runs of its own, whose time would count as the setting's",
+        "-restart": "each run of a ladder begins at rest",
+        "-output_dir": "it is chosen by the tool; --output names the folder"}
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """A level in space. words: options that give it. cells: tetrahedra. file: what to make it of, for the reader."""
+    """A level in space. words: options that give it. cells: tetrahedra. origin: what makes its file, for the reader."""
     name: str
     words: tuple
     cells: int
+    origin: str = ""
 
     def size(self):
         """Relative mean edge length."""
@@ -74,14 +84,34 @@ class Setting:
         return f"{self.mesh.name} | {self.steps.name} | {self.solver.name}"
 
 
+def with_files(words):
+    """Words, each option file among them followed by the words that it holds."""
+    found = []
+    for before, word in zip([None, *words], words):
+        found.append(word)
+        if before == "-options_file" and Path(word).is_file():
+            found += with_files(plain_options(Path(word)))
+    return found
+
+
 def of_files(words, key, default=None):
     """Last value of an option among words and the option files that they name, as PETSc reads them."""
+    words = with_files(words)
     for word, value in zip(words, [*words[1:], None]):
-        if word == "-options_file" and value and Path(value).is_file():
-            default = of_files(plain_options(Path(value)), key, default)
-        elif word == key:
+        if word == key:
             default = value
     return default
+
+
+def names_of(words):
+    """Names of all options among words and the option files that they name."""
+    return {word for word in with_files(words) if word.startswith("-")}
+
+
+def refuse_ours(words):
+    """Ends the program if the scene or the user's flags set what the ladders set."""
+    for name in sorted(names_of(words) & OURS.keys()):
+        fail(f"{name} cannot be among the options of the scene or after --: {OURS[name]}")
 
 
 def plain_options(path):
@@ -95,6 +125,11 @@ def cells_of(path):
         return sum(len(block.data) for block in meshio.read(path).cells if block.type == "tetra")
 
 
+def lung_words(size, path):
+    """Words that make a pair of built-in lungs of a size (mm)."""
+    return ["tools/lung_mesh", "--side", "both", "--size", f"{size:g}", "--airway-size", f"{size / AIRWAY:g}", "--output", str(path)]
+
+
 def lung(size, folder, clock):
     """A pair of built-in lungs of a size (mm), made by tools/lung_mesh unless it is there; and the seconds that took."""
     path = folder / f"pair_{size:g}.msh"
@@ -103,8 +138,8 @@ def lung(size, folder, clock):
         folder.mkdir(parents=True, exist_ok=True)
         print(f"making {path.name} ...", flush=True)
         begin, before = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
-        made = subprocess.run([SOURCE / "tools/lung_mesh", "--side", "both", "--size", f"{size:g}", "--airway-size",
-                               f"{size / AIRWAY:g}", "--output", path], capture_output=True, text=True)
+        tool, *words = lung_words(size, path)
+        made = subprocess.run([SOURCE / tool, *words], capture_output=True, text=True)
         if made.returncode:
             fail(made.stderr.strip().splitlines()[-1])
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -115,20 +150,30 @@ def lung(size, folder, clock):
 
 def meshes(options, scene):
     """The ladder in space, coarse to fine, and the seconds that making it took."""
-    given, seconds = list(options.meshes or []), 0
+    given, seconds, origins = list(options.meshes or []), 0, dict(options.origins)
     own = of_files(scene, "-dm_plex_filename")
     if options.lung or not (given or own):
-        made = [lung(size, options.results / "meshes", options.clock) for size in sorted(options.lung or [30, 21, 15], reverse=True)]
+        sizes = sorted(options.lung or [30, 21, 15], reverse=True)
+        made = [lung(size, options.results / "meshes", options.clock) for size in sizes]
         given, seconds = [path for path, _ in made], sum(s for _, s in made)
+        origins = {path: shlex.join(lung_words(size, path)) for size, path in zip(sizes, given)}
     ladder = []
     for path in given or [Path(own)]:
         if not path.is_file():
             fail(f"there is no mesh {path}")
         words, cells = (("-dm_plex_filename", str(path)) if given else ()), cells_of(path)
+        if not cells:
+            fail(f"the mesh {path} has no tetrahedra")
         for level in range(options.refine + 1):
             refined = ("-dm_refine", str(level)) if level else ()
-            ladder.append(Mesh(path.stem + (f" refined {level} x" if level else ""), words + refined, cells * 8 ** level))
-    return sorted(ladder, key=lambda mesh: mesh.cells), seconds
+            ladder.append(Mesh(path.stem + (f" refined {level} x" if level else ""), words + refined, cells * 8 ** level,
+                               origins.get(path, "")))
+    ladder.sort(key=lambda mesh: mesh.cells)
+    for coarse, fine in zip(ladder, ladder[1:]):
+        if fine.cells < ALIKE * coarse.cells:
+            fail(f"the meshes {coarse.name} and {fine.name} have {coarse.cells} and {fine.cells} tetrahedra: levels of the ladder in "
+                 f"space have to differ by {percent(ALIKE - 1)} at least")
+    return ladder, seconds
 
 
 def steps(options, dt):
@@ -148,7 +193,8 @@ def solvers(options):
         path = Path(name) if Path(name).is_file() else SOLVERS / f"{name}.opts"
         if not path.is_file():
             fail(f"there is no solver file {name}; there are {', '.join(p.stem for p in sorted(SOLVERS.glob('*.opts')))}")
-        ladder.append(Solver(path.stem, path))
+        if not any(path.samefile(other.file) for other in ladder):
+            ladder.append(Solver(path.stem, path))
     base = ladder[0]
     for rtol in options.tolerances:
         more = ("-snes_rtol", f"{rtol:g}") + (("-snes_atol", "1e-12") if rtol < 1e-9 else ())
