@@ -114,6 +114,35 @@ std::optional<std::pair<double, double>> both(const ErrorLevel &a, const ErrorLe
   return {{*a.numbers[i].value, *b.numbers[i].value}};
 }
 
+/// Fills in what @p simulation is, but not its name, seconds and numbers.
+PetscErrorCode describe_level(const Simulation &simulation, const Scene &scene, ErrorLevel &level)
+{
+  PetscFunctionBeginUser;
+  level.dt = simulation.wanted_dt();
+  level.cells = scene.mesh().cells();
+  level.volume = scene.mesh().volume() / units::mm3_per_ml;
+  level.steps = static_cast<PetscInt>(simulation.rows().size()) - 1;
+  PetscCall(VecGetSize(simulation.state(), &level.dofs));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Ends the estimate unless @p other is another mesh of the same lung.
+PetscErrorCode check_other_mesh(MPI_Comm comm, const ErrorLevel &run, const ErrorLevel &other)
+{
+  const double ratio = cell_size_ratio(run, other);
+
+  PetscFunctionBeginUser;
+  PulmoUserCheck(std::abs(other.volume / run.volume - 1) < same_lung, comm,
+                 "-error_estimate: the %s holds %.4g ml at rest and the scene's %.4g ml: that is another lung",
+                 other.name.c_str(), other.volume, run.volume);
+  PulmoUserCheck(
+      std::max(ratio, 1 / ratio) >= least_ratio, comm,
+      "-error_estimate: the cells of the %s are %.3g times as large as the scene's; give one whose cells are "
+      "at least %.2g times larger or smaller",
+      other.name.c_str(), ratio, least_ratio);
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 } // namespace
 
 TimeError time_error(double fine, double twice, double four_times, int order)
@@ -268,34 +297,6 @@ PetscErrorCode ErrorEstimate::run_level(const Options &options, const Output &ou
                                      run.scene().functional_residual_capacity());
   else
     level.failure = simulation.failure_text();
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode describe_level(const Simulation &simulation, const Scene &scene, ErrorLevel &level)
-{
-  PetscFunctionBeginUser;
-  level.dt = simulation.wanted_dt();
-  level.cells = scene.mesh().cells();
-  level.volume = scene.mesh().volume() / units::mm3_per_ml;
-  level.steps = static_cast<PetscInt>(simulation.rows().size()) - 1;
-  PetscCall(VecGetSize(simulation.state(), &level.dofs));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-/// Ends the estimate unless @p other is another mesh of the same lung.
-PetscErrorCode ErrorEstimate::check_other_mesh(MPI_Comm comm, const ErrorLevel &run, const ErrorLevel &other) const
-{
-  const double ratio = cell_size_ratio(run, other);
-
-  PetscFunctionBeginUser;
-  PulmoUserCheck(std::abs(other.volume / run.volume - 1) < same_lung, comm,
-                 "-error_estimate: the %s holds %.4g ml at rest and the scene's %.4g ml: that is another lung",
-                 other.name.c_str(), other.volume, run.volume);
-  PulmoUserCheck(
-      std::max(ratio, 1 / ratio) >= least_ratio, comm,
-      "-error_estimate: the cells of the %s are %.3g times as large as the scene's; give one whose cells are "
-      "at least %.2g times larger or smaller",
-      other.name.c_str(), ratio, least_ratio);
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -51,9 +51,6 @@ struct ErrorLevel {
   std::vector<ClinicalEntry> numbers;
 };
 
-/// Fills in what @p simulation is, but not its name, seconds and numbers.
-PetscErrorCode describe_level(const Simulation &simulation, const Scene &scene, ErrorLevel &level);
-
 /// What an estimate found.
 struct ErrorReport {
   std::vector<ErrorBar> bars;     ///< one for each clinical number that the run has
@@ -83,7 +80,6 @@ private:
   PetscErrorCode coarser_steps(const Simulation &simulation, int factor, Changes &changes) const;
   PetscErrorCode tighter_solver(const Simulation &simulation, Changes &changes) const;
   PetscErrorCode other_mesh(Changes &changes, std::string &name) const;
-  PetscErrorCode check_other_mesh(MPI_Comm comm, const ErrorLevel &run, const ErrorLevel &other) const;
   PetscErrorCode run_level(const Options &options, const Output &output, const Changes &changes,
                            ErrorLevel &level) const;
 
