@@ -46,19 +46,9 @@ PetscErrorCode open_part(MPI_Comm comm, const std::string &file, ViewerHandle &v
 
 PetscErrorCode close_whole(MPI_Comm comm, const std::string &file, ViewerHandle &viewer)
 {
-  PetscMPIInt rank;
-  bool renamed = true;
-
   PetscFunctionBeginUser;
   viewer.reset();
-  PetscCallMPI(MPI_Comm_rank(comm, &rank));
-  if (rank == 0) {
-    std::error_code error;
-    std::filesystem::rename(file + ".part", file, error);
-    renamed = !error;
-  }
-  PetscCall(from_root(comm, renamed));
-  PulmoUserCheck(renamed, comm, "cannot write %s; free the disk or choose another -output_dir", file.c_str());
+  PetscCall(take_name(comm, true, file));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

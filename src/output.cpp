@@ -15,21 +15,27 @@ namespace fs = std::filesystem;
 
 } // namespace
 
-PetscErrorCode finish_file(MPI_Comm comm, std::ofstream &f, const std::string &file)
+PetscErrorCode take_name(MPI_Comm comm, bool written, const std::string &file)
 {
   PetscMPIInt rank;
-  bool written = true;
 
   PetscFunctionBeginUser;
   PetscCallMPI(MPI_Comm_rank(comm, &rank));
-  if (rank == 0) {
+  if (rank == 0 && written) {
     std::error_code error;
-    f.close();
-    if (f.good()) fs::rename(file + ".part", file, error);
-    written = f.good() && !error;
+    fs::rename(file + ".part", file, error);
+    written = !error;
   }
   PetscCall(from_root(comm, written));
   PulmoUserCheck(written, comm, "cannot write %s; free the disk or choose another -output_dir", file.c_str());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode finish_file(MPI_Comm comm, std::ofstream &f, const std::string &file)
+{
+  PetscFunctionBeginUser;
+  f.close(); // not open on other ranks
+  PetscCall(take_name(comm, f.good(), file));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -161,20 +167,17 @@ PetscErrorCode SignalWriter::observe(const StepReport &step)
 PetscErrorCode SignalWriter::finish()
 {
   PetscMPIInt rank;
-  bool written = true;
+  bool open = file_ != nullptr, written = true;
 
   PetscFunctionBeginUser;
   PetscCallMPI(MPI_Comm_rank(comm_, &rank));
-  if (rank == 0 && file_) {
-    std::error_code error;
+  PetscCall(from_root(comm_, open));
+  if (!open) PetscFunctionReturn(PETSC_SUCCESS);
+  if (rank == 0) {
     written = std::fclose(file_) == 0;
     file_ = nullptr;
-    fs::rename(output_.path("signals.csv.part"), output_.path("signals.csv"), error);
-    written = written && !error;
   }
-  PetscCall(from_root(comm_, written));
-  PulmoUserCheck(written, comm_, "cannot write %s; free the disk or choose another -output_dir",
-                 output_.path("signals.csv").c_str());
+  PetscCall(take_name(comm_, written, output_.path("signals.csv")));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

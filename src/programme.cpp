@@ -275,7 +275,7 @@ PetscErrorCode read_programme(MPI_Comm comm, const std::string &option, const st
 {
   PetscMPIInt rank;
   std::string text;
-  long size = -1; // -1: cannot be read
+  bool readable = false;
 
   PetscFunctionBeginUser;
   PetscCallMPI(MPI_Comm_rank(comm, &rank));
@@ -283,14 +283,15 @@ PetscErrorCode read_programme(MPI_Comm comm, const std::string &option, const st
     std::ifstream in(file, std::ios::binary);
     text.resize(static_cast<std::size_t>(largest_file) + 1);
     in.read(text.data(), static_cast<std::streamsize>(text.size()));
-    if (in.is_open() && !in.bad()) size = static_cast<long>(in.gcount());
+    readable = in.is_open() && !in.bad();
+    text.resize(static_cast<std::size_t>(in.gcount()));
   }
-  PetscCallMPI(MPI_Bcast(&size, 1, MPI_LONG, 0, comm));
-  PulmoUserCheck(size >= 0, comm, "cannot read %s (%s); check its name", file.c_str(), option.c_str());
-  PulmoUserCheck(size <= largest_file, comm, "%s (%s) has more than %ld MB: it is no programme; check its name",
-                 file.c_str(), option.c_str(), largest_file >> 20);
-  text.resize(static_cast<std::size_t>(size));
-  PetscCallMPI(MPI_Bcast(text.data(), static_cast<PetscMPIInt>(size), MPI_CHAR, 0, comm));
+  PetscCall(from_root(comm, readable));
+  PulmoUserCheck(readable, comm, "cannot read %s (%s); check its name", file.c_str(), option.c_str());
+  PetscCall(from_root(comm, text));
+  PulmoUserCheck(text.size() <= static_cast<std::size_t>(largest_file), comm,
+                 "%s (%s) has more than %ld MB: it is no programme; check its name", file.c_str(), option.c_str(),
+                 largest_file >> 20);
   PetscCall(parse_programme(comm, file, text, phases));
   PetscFunctionReturn(PETSC_SUCCESS);
 }

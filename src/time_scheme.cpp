@@ -26,9 +26,8 @@ PetscErrorCode TimeScheme::setup(TS ts, Vec like)
   PetscCall(DMGetNumFields(dm, &fields));
   gas_ = multistep_ && fields > pressure;
   if (!gas_) PetscFunctionReturn(PETSC_SUCCESS);
-  for (Past *past : {&last_, &earlier_, &middle_})
-    for (VecHandle *v : {&past->state, &past->gas}) PetscCall(VecDuplicate(like, v->out()));
-  PetscCall(VecDuplicate(like, zero_.out()));
+  for (VecHandle *v : {&last_.state, &earlier_.state, &last_.gas, &earlier_.gas, &middle_.gas, &zero_, &rest_})
+    PetscCall(VecDuplicate(like, v->out()));
   PetscCall(VecZeroEntries(zero_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -36,20 +35,18 @@ PetscErrorCode TimeScheme::setup(TS ts, Vec like)
 PetscErrorCode TimeScheme::keep(Model &model, PetscReal t, PetscReal volume, Vec local, Past &past)
 {
   PetscSection section;
-  VecHandle rest;
   PetscInt begin, end;
 
   PetscFunctionBeginUser;
   past.time = t;
   past.volume = volume;
   if (!gas_) PetscFunctionReturn(PETSC_SUCCESS);
-  PetscCall(VecCopy(local, past.state));
+  if (past.state) PetscCall(VecCopy(local, past.state));
   // with dt = 1 s and the state as its own rate the kernels integrate J - 1, and what does not depend on the rate
-  PetscCall(VecDuplicate(past.gas, rest.out()));
   PetscCall(model.set_step(1, 0));
   PetscCall(model.residual(t, local, local, past.gas));
-  PetscCall(model.residual(t, local, zero_, rest));
-  PetscCall(VecAXPY(past.gas, -1, rest));
+  PetscCall(model.residual(t, local, zero_, rest_));
+  PetscCall(VecAXPY(past.gas, -1, rest_));
   PetscCall(VecScale(past.gas, 1 / model.row_scale(pressure)));
   PetscCall(DMGetLocalSection(model.dm(), &section));
   WriteArray g(past.gas);

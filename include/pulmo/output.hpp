@@ -14,8 +14,10 @@ namespace pulmo {
 
 class ErrorIndicator;
 
-/// Gives @p file, which rank 0 wrote through @p f under its name and ".part", its own name; a user error on all ranks
-/// if that or the writing failed.
+/// Gives @p file, which was written under its name and ".part", its own name; a user error on all ranks if that or the
+/// writing (rank 0's @p written) failed.
+PetscErrorCode take_name(MPI_Comm comm, bool written, const std::string &file);
+/// The same for what rank 0 wrote through @p f.
 PetscErrorCode finish_file(MPI_Comm comm, std::ofstream &f, const std::string &file);
 
 /// The run's directory and the options `-output_*`, `-progress`.

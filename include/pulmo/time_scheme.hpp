@@ -50,7 +50,7 @@ public:
 private:
   struct Past {
     PetscReal time = 0, volume = 0; ///< s, mm^3
-    VecHandle state;                ///< local
+    VecHandle state;                ///< local; a half step's is not kept, as no checkpoint holds it
     VecHandle gas;                  ///< local: its int (J - 1) q in the mass rows, mm^3
   };
 
@@ -65,7 +65,7 @@ private:
   std::array<const Past *, 2> used_{};
   std::array<PetscReal, 2> weight_{};
   PetscReal slope_ = 1;
-  VecHandle zero_;
+  VecHandle zero_, rest_; ///< local: zero; for keep()
 };
 
 } // namespace pulmo
