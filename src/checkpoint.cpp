@@ -197,7 +197,7 @@ PetscErrorCode Checkpoint::persist_scene(Archive &archive)
 
 PetscErrorCode Checkpoint::compare_options(const std::string &stored) const
 {
-  std::vector<std::pair<std::string, std::string>> then;
+  OptionList then;
   const auto now = options_.own_used();
   std::istringstream lines(stored);
 

@@ -32,6 +32,12 @@ constexpr PetscReal tighter = 0.01, tightest = 1e-12;
 constexpr const char *output_prefixes[] = {"-output",     "-progress", "-effects",       "-energy",
                                            "-checkpoint", "-restart",  "-error_estimate"};
 
+/// The runs that are compared, in this order: what is wrong with the other mesh is said before the rest is run.
+enum { fine, other, twice, four_times, tight, n_levels };
+
+/// What each step leaves undone may add up, and the solver is judged by runs of so many times fewer steps.
+constexpr double steps_saved = 4;
+
 /// Ends of the names of PETSc's options that print or write, maybe to a file of the run itself.
 constexpr const char *viewer_ends[] = {"_view", "_view_pre", "_monitor", "_converged_reason"};
 
@@ -67,7 +73,7 @@ public:
   OptionsInForce(const OptionsInForce &) = delete;
   OptionsInForce &operator=(const OptionsInForce &) = delete;
 
-  PetscErrorCode put(const std::vector<std::pair<std::string, std::string>> &list)
+  PetscErrorCode put(const OptionList &list)
   {
     PetscFunctionBeginUser;
     PetscCall(PetscOptionsCreate(&options_));
@@ -84,9 +90,9 @@ private:
 };
 
 /// Names and values of the database; unlike Options::all_given() with blanks and dashes in values as they are.
-PetscErrorCode given_options(const Options &options, std::vector<std::pair<std::string, std::string>> &list)
+PetscErrorCode given_options(const Options &options, OptionList &list)
 {
-  std::vector<std::pair<std::string, std::string>> words;
+  OptionList words;
 
   PetscFunctionBeginUser;
   PetscCall(options.all_given(words));
@@ -141,6 +147,62 @@ PetscErrorCode check_other_mesh(MPI_Comm comm, const ErrorLevel &run, const Erro
       "at least %.2g times larger or smaller",
       other.name.c_str(), ratio, least_ratio);
   PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Options that make steps @p factor times as long.
+PetscErrorCode coarser_steps(const Simulation &simulation, int factor, OptionList &changes)
+{
+  const StepControl &control = simulation.step_control();
+  const double looser = std::pow(factor, simulation.scheme().order() + 1); // a step's error is of order dt^(order + 1)
+  TSAdapt adapt;
+  PetscReal longest;
+
+  PetscFunctionBeginUser;
+  changes.emplace_back("-ts_dt", text_of(factor * simulation.wanted_dt()));
+  if (!control.in_use()) PetscFunctionReturn(PETSC_SUCCESS);
+  changes.emplace_back("-step_volume_tolerance", text_of(looser * control.volume_tolerance()));
+  changes.emplace_back("-step_pressure_tolerance", text_of(looser * control.pressure_tolerance()));
+  PetscCall(TSGetAdapt(simulation.ts(), &adapt));
+  PetscCall(TSAdaptGetStepLimits(adapt, nullptr, &longest));
+  changes.emplace_back("-ts_adapt_dt_max", text_of(factor * longest));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Options that leave the solver a hundredth of its error.
+PetscErrorCode tighter_solver(const Simulation &simulation, OptionList &changes)
+{
+  SNES snes;
+  PetscReal absolute, relative, step;
+
+  PetscFunctionBeginUser;
+  PetscCall(TSGetSNES(simulation.ts(), &snes));
+  PetscCall(SNESGetTolerances(snes, &absolute, &relative, &step, nullptr, nullptr));
+  const auto tighten = [&](const char *option, PetscReal tolerance) {
+    if (tolerance > tightest) changes.emplace_back(option, text_of(std::max(tightest, tighter * tolerance)));
+  };
+  tighten("-snes_rtol", relative);
+  tighten("-snes_atol", absolute);
+  tighten("-snes_stol", step);
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// The error bar of number @p i. @p order: of the time scheme, or 0 if the steps of the levels tell nothing.
+ErrorBar error_bar(const std::vector<ErrorLevel> &levels, std::size_t i, int order)
+{
+  const auto short_steps = both(levels[fine], levels[twice], i),
+             long_steps = both(levels[twice], levels[four_times], i),
+             solver = both(levels[four_times], levels[tight], i), space = both(levels[four_times], levels[other], i);
+  ErrorBar bar;
+
+  bar.entry = levels[fine].numbers[i];
+  if (order > 0 && short_steps && long_steps) {
+    const TimeError time = time_error(short_steps->first, short_steps->second, long_steps->second, order);
+    bar.time = time.error;
+    bar.time_order = time.order;
+  }
+  if (solver) bar.solver = steps_saved * std::abs(solver->first - solver->second);
+  if (space) bar.space = space_error(space->first - space->second, cell_size_ratio(levels[fine], levels[other]));
+  return bar;
 }
 
 } // namespace
@@ -202,42 +264,7 @@ PetscErrorCode ErrorEstimate::check(const Options &options, const Scene &scene) 
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode ErrorEstimate::coarser_steps(const Simulation &simulation, int factor, Changes &changes) const
-{
-  const StepControl &control = simulation.step_control();
-  const double looser = std::pow(factor, simulation.scheme().order() + 1); // a step's error is of order dt^(order + 1)
-  TSAdapt adapt;
-  PetscReal longest;
-
-  PetscFunctionBeginUser;
-  changes.emplace_back("-ts_dt", text_of(factor * simulation.wanted_dt()));
-  if (!control.in_use()) PetscFunctionReturn(PETSC_SUCCESS);
-  changes.emplace_back("-step_volume_tolerance", text_of(looser * control.volume_tolerance()));
-  changes.emplace_back("-step_pressure_tolerance", text_of(looser * control.pressure_tolerance()));
-  PetscCall(TSGetAdapt(simulation.ts(), &adapt));
-  PetscCall(TSAdaptGetStepLimits(adapt, nullptr, &longest));
-  changes.emplace_back("-ts_adapt_dt_max", text_of(factor * longest));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode ErrorEstimate::tighter_solver(const Simulation &simulation, Changes &changes) const
-{
-  SNES snes;
-  PetscReal absolute, relative, step;
-
-  PetscFunctionBeginUser;
-  PetscCall(TSGetSNES(simulation.ts(), &snes));
-  PetscCall(SNESGetTolerances(snes, &absolute, &relative, &step, nullptr, nullptr));
-  const auto tighten = [&](const char *option, PetscReal tolerance) {
-    if (tolerance > tightest) changes.emplace_back(option, text_of(std::max(tightest, tighter * tolerance)));
-  };
-  tighten("-snes_rtol", relative);
-  tighten("-snes_atol", absolute);
-  tighten("-snes_stol", step);
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode ErrorEstimate::other_mesh(Changes &changes, std::string &name) const
+PetscErrorCode ErrorEstimate::other_mesh(OptionList &changes, std::string &name) const
 {
   PetscInt refined = 0;
 
@@ -254,11 +281,11 @@ PetscErrorCode ErrorEstimate::other_mesh(Changes &changes, std::string &name) co
 }
 
 /// Runs the scene with @p changes to its options.
-PetscErrorCode ErrorEstimate::run_level(const Options &options, const Output &output, const Changes &changes,
+PetscErrorCode ErrorEstimate::run_level(const Options &options, const Output &output, const OptionList &changes,
                                         ErrorLevel &level) const
 {
   const MPI_Comm comm = options.comm();
-  Changes list;
+  OptionList list;
   PetscLogDouble begin, end;
   bool finished;
 
@@ -293,8 +320,7 @@ PetscErrorCode ErrorEstimate::run_level(const Options &options, const Output &ou
   PetscCall(describe_level(simulation, run.scene(), level));
   level.seconds = end - begin;
   if (finished)
-    level.numbers = clinical_entries(overall_numbers(regions.complete(simulation.rows())),
-                                     run.scene().functional_residual_capacity());
+    level.numbers = regions.numbers(simulation.rows());
   else
     level.failure = simulation.failure_text();
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -305,9 +331,7 @@ PetscErrorCode ErrorEstimate::make(const Options &options, const Output &output,
                                    ErrorReport &report) const
 {
   const MPI_Comm comm = options.comm();
-  // the other mesh first: what is wrong with it is said before the rest is run
-  enum { fine, other, twice, four_times, tight, n_levels };
-  std::array<Changes, n_levels> changes;
+  std::array<OptionList, n_levels> changes;
   auto &levels = report.levels;
   PetscInt count = 0;
 
@@ -337,24 +361,8 @@ PetscErrorCode ErrorEstimate::make(const Options &options, const Output &output,
   if (!longer && levels[twice].failure.empty() && levels[four_times].failure.empty())
     levels[twice].failure = "its steps are hardly longer, as the phases are too short for that: no error in time; a "
                             "run with a smaller -ts_dt tells";
-  const double ratio = cell_size_ratio(levels[fine], levels[other]);
-  for (std::size_t i = 0; i < numbers.size(); ++i) {
-    if (!numbers[i].value) continue;
-    ErrorBar bar;
-    bar.entry = numbers[i];
-    const auto short_steps = both(levels[fine], levels[twice], i),
-               long_steps = both(levels[twice], levels[four_times], i),
-               solver = both(levels[four_times], levels[tight], i), space = both(levels[four_times], levels[other], i);
-    if (longer && short_steps && long_steps) {
-      const TimeError time =
-          time_error(short_steps->first, short_steps->second, long_steps->second, simulation.scheme().order());
-      bar.time = time.error;
-      bar.time_order = time.order;
-    }
-    if (solver) bar.solver = 4 * std::abs(solver->first - solver->second); // what each step leaves may add up
-    if (space) bar.space = space_error(space->first - space->second, ratio);
-    report.bars.push_back(bar);
-  }
+  for (std::size_t i = 0; i < numbers.size(); ++i)
+    if (numbers[i].value) report.bars.push_back(error_bar(levels, i, longer ? simulation.scheme().order() : 0));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

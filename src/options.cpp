@@ -62,7 +62,7 @@ std::optional<bool> truth(std::string value)
 }
 
 /// Whether the last `-name` of the list says off.
-bool turned_off(const std::vector<std::pair<std::string, std::string>> &list, const std::string &name)
+bool turned_off(const OptionList &list, const std::string &name)
 {
   bool off = false;
   for (const auto &[option, value] : list)
@@ -294,7 +294,7 @@ std::string Options::misspelt(const std::string &name) const
   return "";
 }
 
-PetscErrorCode Options::all_given(std::vector<std::pair<std::string, std::string>> &list) const
+PetscErrorCode Options::all_given(OptionList &list) const
 {
   char *all = nullptr;
 
@@ -315,9 +315,9 @@ PetscErrorCode Options::all_given(std::vector<std::pair<std::string, std::string
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-std::vector<std::pair<std::string, std::string>> Options::own_used() const
+OptionList Options::own_used() const
 {
-  std::vector<std::pair<std::string, std::string>> list;
+  OptionList list;
   for (const Declared &d : declared_)
     if (groups_[d.group].in_use) list.emplace_back(d.name, d.used);
   return list;
@@ -335,9 +335,9 @@ bool Options::same_value(const std::string &a, const std::string &b)
                     });
 }
 
-PetscErrorCode Options::all_used(std::vector<std::pair<std::string, std::string>> &list) const
+PetscErrorCode Options::all_used(OptionList &list) const
 {
-  std::vector<std::pair<std::string, std::string>> given;
+  OptionList given;
 
   PetscFunctionBeginUser;
   list = own_used();
@@ -352,7 +352,7 @@ PetscErrorCode Options::all_used(std::vector<std::pair<std::string, std::string>
 
 PetscErrorCode Options::check_unknown() const
 {
-  std::vector<std::pair<std::string, std::string>> list;
+  OptionList list;
 
   PetscFunctionBeginUser;
   PetscCall(all_given(list));

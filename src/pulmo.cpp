@@ -20,7 +20,7 @@ std::string option_error(PetscErrorCode code, const std::string &message, const 
                : "";
   // -ts_dt short: PETSc names the word only
   const std::string word = message.substr(no_number.size(), message.find(' ', no_number.size()) - no_number.size());
-  std::vector<std::pair<std::string, std::string>> given;
+  OptionList given;
   std::string option = "an option";
   (void)Options(PETSC_COMM_WORLD).all_given(given);
   for (const auto &[name, value] : given)
@@ -262,9 +262,7 @@ PetscErrorCode run(const Registry &registry, bool &finished)
                           asked_to_stop ? "the run was asked to stop" : "the run ends before its first breath"));
   } else if (error_estimate.in_use()) {
     ErrorReport report;
-    const auto numbers =
-        clinical_entries(overall_numbers(regions.complete(simulation.rows())), scene.functional_residual_capacity());
-    PetscCall(error_estimate.make(options, output, scene, simulation, numbers, report));
+    PetscCall(error_estimate.make(options, output, scene, simulation, regions.numbers(simulation.rows()), report));
     audits.errors = &report;
     PetscCall(write_summary(options, output, scene, run.model(), simulation, audits, true));
     PetscCall(print_error_bars(comm, report));

@@ -100,7 +100,7 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
   const MPI_Comm comm = options.comm();
   PetscMPIInt rank, size;
   PetscInt dofs;
-  std::vector<std::pair<std::string, std::string>> used;
+  OptionList used;
   std::ofstream f;
 
   PetscFunctionBeginUser;

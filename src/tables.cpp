@@ -58,7 +58,7 @@ PetscErrorCode print_numbers(MPI_Comm comm, const Output &output, const Scene &s
     PetscCall(PetscPrintf(comm,
                           "\n%s tissue, %.0f ml at rest: clinical numbers of the last breath (fits over all breaths)\n",
                           scene.tissue().law().name(), (double)(scene.mesh().volume() / units::mm3_per_ml)));
-    for (const ClinicalEntry &e : clinical_entries(overall_numbers(rows), scene.functional_residual_capacity())) {
+    for (const ClinicalEntry &e : audits.regions.numbers(simulation.rows())) {
       if (!e.value) continue;
       const double shown = std::abs(*e.value) < 1e-9 ? 0 : *e.value; // what the solver left of a zero
       PetscCall(PetscPrintf(comm, "  %-28s %12.4g %s\n", e.label, shown, e.unit));

@@ -74,13 +74,8 @@ public:
                       const std::vector<ClinicalEntry> &numbers, ErrorReport &report) const;
 
 private:
-  /// Another value of an option for one level.
-  using Changes = std::vector<std::pair<std::string, std::string>>;
-
-  PetscErrorCode coarser_steps(const Simulation &simulation, int factor, Changes &changes) const;
-  PetscErrorCode tighter_solver(const Simulation &simulation, Changes &changes) const;
-  PetscErrorCode other_mesh(Changes &changes, std::string &name) const;
-  PetscErrorCode run_level(const Options &options, const Output &output, const Changes &changes,
+  PetscErrorCode other_mesh(OptionList &changes, std::string &name) const;
+  PetscErrorCode run_level(const Options &options, const Output &output, const OptionList &changes,
                            ErrorLevel &level) const;
 
   const Registry &registry_;

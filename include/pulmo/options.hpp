@@ -26,6 +26,9 @@ struct Range {
   std::string text() const;
 };
 
+/// Names and values of options.
+using OptionList = std::vector<std::pair<std::string, std::string>>;
+
 /// Names of PETSc's options that a misspelt one may be meant for.
 const std::vector<std::string> &petsc_names();
 
@@ -72,12 +75,12 @@ public:
   /// Prints every declared option (the part of -help that is pulmo's own).
   PetscErrorCode print_help() const;
   /// Name and value of each option in the database.
-  PetscErrorCode all_given(std::vector<std::pair<std::string, std::string>> &list) const;
+  PetscErrorCode all_given(OptionList &list) const;
   /// Name and value of every option that the run used: pulmo's own of what is in use, defaults included, and PETSc's
   /// as given.
-  PetscErrorCode all_used(std::vector<std::pair<std::string, std::string>> &list) const;
+  PetscErrorCode all_used(OptionList &list) const;
   /// The first half of it: pulmo's own.
-  std::vector<std::pair<std::string, std::string>> own_used() const;
+  OptionList own_used() const;
   /// Whether two values of an option say the same: 1e4 and 10000, on and true.
   static bool same_value(const std::string &a, const std::string &b);
 

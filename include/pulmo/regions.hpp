@@ -38,6 +38,11 @@ public:
   std::optional<double> ventilation_share(const BreathRows &breath, std::size_t region) const;
   /// The signals with the mean alveolar pressure of the whole lung filled in.
   std::vector<SignalRow> complete(std::vector<SignalRow> rows) const;
+  /// The clinical numbers of a run with these signals.
+  std::vector<ClinicalEntry> numbers(const std::vector<SignalRow> &rows) const
+  {
+    return clinical_entries(overall_numbers(complete(rows)), scene_.functional_residual_capacity());
+  }
 
 private:
   const Scene &scene_;
