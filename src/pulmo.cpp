@@ -162,7 +162,7 @@ PetscErrorCode Run::setup()
   PetscCall(options_.check_unknown());
   PetscCall(options_.check_petsc());
   PetscCall(scene_.prepare(options_));
-  Composition composition(scene_.mesh());
+  Composition composition(scene_.mesh(), scene_.facts().elements);
   PetscCall(scene_.compose(composition));
   PetscCall(model_.build(std::move(composition), reference_modulus(scene_.tissue().law())));
   PetscCall(simulation_.setup());
@@ -205,6 +205,9 @@ PetscErrorCode run(const Registry &registry, bool &finished)
   }
   PetscCall(check_held(comm, scene, run.model().composition()));
   PetscCall(error_estimate.check(options, scene));
+  const Elements &elements = scene.facts().elements;
+  PulmoUserCheck(!output.error_indicator() || (elements.displacement == 2 && elements.pressure == 1), comm,
+                 "-output_fields_error_indicator recovers the stress of -elements P2-P1; leave one of the two out");
 
   SignalWriter signals(comm, output, scene.facts());
   ProgressPrinter progress(comm, scene.facts());

@@ -96,6 +96,7 @@ private:
   PetscErrorCode create_fields();
   PetscErrorCode create_weak_form();
   PetscErrorCode create_section();
+  PetscErrorCode add_symmetries(PetscSection section) const;
   PetscErrorCode find_constraints(std::vector<PetscInt> &constraint_of);
   PetscErrorCode find_airway(const std::vector<PetscInt> &constraint_of);
   PetscErrorCode find_carrier();
@@ -121,7 +122,7 @@ private:
   Step step_{1, 0, 0, 1};
   PetscReal modulus_ = 1;
   std::vector<PetscReal> row_scale_;
-  PetscInt quadrature_degree_ = 3;
+  PetscInt quadrature_degree_ = 0;
   bool own_ = true;
   Assembly assembly_;
   FixedStress fixed_stress_;

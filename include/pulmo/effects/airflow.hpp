@@ -106,7 +106,7 @@ struct DarcyKernels {
   }
 };
 
-/// Alveolar pressure field (P1, kPa), its gas stress, mass balance and Darcy flux. Where the lung is open the
+/// Alveolar pressure field (kPa), its gas stress, mass balance and Darcy flux. Where the lung is open the
 /// ventilator holds p or prescribes the flux.
 class Airflow final : public Effect {
 public:
@@ -160,7 +160,7 @@ public:
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
-  void fields(Composition &c) const override { c.field("pressure", 1, 1, "kPa"); }
+  void fields(Composition &c) const override { c.field("pressure", 1, c.elements().pressure, "kPa"); }
 
   PetscErrorCode terms(Composition &c, const SceneFacts &) const override
   {

@@ -306,16 +306,14 @@ TYPED_TEST_SUITE(ManufacturedRun, LawsWithShearModulus, LawNames);
 template <class L>
 constexpr bool three_meshes = std::is_same_v<L, mms::Yoshihara> || std::is_same_v<L, mms::Birzle>;
 
-/// Errors on cube_coarse, cube and (three meshes) cube_fine, h halved each time; four steps of 0.25 s.
+/// Errors on @p meshes, h halved each time; four steps of 0.25 s.
 template <class Law, class Solution>
-void convergence(std::vector<Errors> &e)
+void convergence(const std::vector<std::string> &meshes, const std::string &more, std::vector<Errors> &e)
 {
-  std::vector<std::string> meshes{"cube_coarse", "cube"};
-  if (three_meshes<Law>) meshes.push_back("cube_fine");
   for (const std::string &mesh : meshes) {
     pulmo::Run run(manufactured<Law, Solution>(false));
     bool finished = false;
-    PULMO_OK(prepare(run, options(Law::name, mesh, 0.25, false)));
+    PULMO_OK(prepare(run, options(Law::name, mesh, 0.25, false) + " " + more));
     PULMO_OK(run.simulation().run(finished));
     ASSERT_TRUE(finished) << run.simulation().failure_text();
     ASSERT_NEAR(run.simulation().time(), 1, 1e-9);
@@ -334,6 +332,15 @@ void convergence(std::vector<Errors> &e)
   }
   EXPECT_GT(e.back().u, 1e-8) << "an error of nothing means that nothing was tested";
   EXPECT_GT(e.back().p, 1e-8);
+}
+
+/// P2-P1 on cube_coarse, cube and (three meshes) cube_fine, with the error indicators.
+template <class Law, class Solution>
+void convergence(std::vector<Errors> &e)
+{
+  std::vector<std::string> meshes{"cube_coarse", "cube"};
+  if (three_meshes<Law>) meshes.push_back("cube_fine");
+  ASSERT_NO_FATAL_FAILURE((convergence<Law, Solution>(meshes, "", e)));
   // stress: what the error of p makes of u is smooth and partly missed
   EXPECT_GT(e.back().estimated_tissue, 0.6 * e.back().tissue);
   EXPECT_LT(e.back().estimated_tissue, 1.1 * e.back().tissue);
@@ -364,6 +371,39 @@ TYPED_TEST(ManufacturedRun, DiscretisationErrorOfDisplacement)
   EXPECT_GT(order(c.grad_u, f.grad_u), 1.8);
   EXPECT_GT(order(c.p, f.p), 1.8);
 }
+
+/// Orders that an element pair should show: u and p not in their spaces, then p in its space.
+struct PairOrders {
+  const char *options;
+  const char *finest; ///< mesh
+  double u, grad_u, p, grad_p;
+  double u_alone; ///< of u where p is in its space
+};
+class ManufacturedElements : public ::testing::TestWithParam<PairOrders> {};
+
+TEST_P(ManufacturedElements, DiscretisationError)
+{
+  using Law = mms::Yoshihara;
+  const PairOrders &orders = GetParam();
+  std::vector<std::string> meshes{"cube_coarse", "cube"};
+  if (orders.finest != meshes.back()) meshes.emplace_back(orders.finest);
+  std::vector<Errors> e;
+  ASSERT_NO_FATAL_FAILURE((convergence<Law, mms::Waves<Law>>(meshes, orders.options, e)));
+  const Errors &c = e[e.size() - 2], &f = e.back();
+  EXPECT_GT(order(c.u, f.u), orders.u);
+  EXPECT_GT(order(c.grad_u, f.grad_u), orders.grad_u);
+  EXPECT_GT(order(c.p, f.p), orders.p);
+  EXPECT_GT(order(c.grad_p, f.grad_p), orders.grad_p);
+
+  e.clear();
+  ASSERT_NO_FATAL_FAILURE((convergence<Law, mms::WavesLinearPressure<Law>>(meshes, orders.options, e)));
+  EXPECT_GT(order(e[e.size() - 2].u, e.back().u), orders.u_alone);
+}
+
+INSTANTIATE_TEST_SUITE_P(Pairs, ManufacturedElements,
+                         ::testing::Values(PairOrders{"-elements P1-P1", "cube_fine", 1.7, 0.85, 1.7, 0.85, 1.7},
+                                           PairOrders{"-elements P3-P2", "cube", 2.7, 2.7, 2.7, 1.8, 3.7}),
+                         [](const auto &pair) { return pair.index == 0 ? "P1P1" : "P3P2"; });
 
 // (b) The interpolant of the exact solution nearly solves the discrete equations, and better on finer meshes.
 TYPED_TEST(Manufactured, ResidualOfTheInterpolant)
