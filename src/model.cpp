@@ -107,6 +107,9 @@ PetscErrorCode Model::create_fields()
     PetscCall(PetscFESetFromOptions(fe));
     PetscCall(PetscObjectTypeCompare((PetscObject)(PetscFE)fe, "pulmo", &own));
     own_ = own;
+    PulmoUserCheck(own_ || quadrature_degree_ > 1, comm,
+                   "-petscfe_type basic: PETSc has no room for the points of facets where cells have one; give "
+                   "-quadrature_degree 2 or leave basic out");
     PetscCall(DMSetField(dm_, index++, nullptr, (PetscObject)(PetscFE)fe));
     if (index == 1) PetscCall(DMGetField(dm_, 0, nullptr, (PetscObject *)&first));
   }
