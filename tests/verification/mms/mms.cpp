@@ -26,17 +26,11 @@ using namespace pulmo::test;
 namespace {
 
 template <class Law, class Solution>
-class ManufacturedLoads final : public Effect {
+class ManufacturedLoads final : public TestEffect {
 public:
   explicit ManufacturedLoads(bool weak) : weak_(weak) {}
   const char *name() const override { return "manufactured"; }
   const char *about() const override { return "loads of a manufactured solution (verification)"; }
-  PetscErrorCode declare(Options &options) override
-  {
-    options.group(name(), about());
-    return PETSC_SUCCESS;
-  }
-  bool active() const override { return true; }
   PetscErrorCode terms(Composition &c, const SceneFacts &) const override
   {
     using S = mms::Sources<Law, Solution>;
