@@ -1,5 +1,6 @@
 #!/usr/bin/python3
 """-error_estimate: error bars hold the numbers of a run far finer, on any number of ranks, and cost nothing of the run."""
+import functools
 import os
 import shutil
 import unittest
@@ -17,6 +18,12 @@ BDF2 = ["-ts_type", "bdf"]
 NUMBERS = ["tidal_volume_ml", "peak_flow_ml_per_s", "peak_expiratory_flow_ml_per_s", "compliance_ml_per_cmH2O",
            "resistance_cmH2O_s_per_l", "time_constant_s", "work_j", "auto_peep_cmH2O",
            "trapped_volume_ml"]  # none is another one up to a factor
+
+
+@functools.cache
+def estimated(*scheme):
+    """The scene's run with its bars, made once: the tests only read it."""
+    return pc.finished(SCENE + STEPS + list(scheme) + ESTIMATE)
 
 
 def bars(case):
@@ -41,8 +48,7 @@ class ErrorEstimate(unittest.TestCase):
         for name, scheme in (("backward Euler", []), ("BDF2", BDF2)):
             with self.subTest(scheme=name):
                 print(f"\n{name}, 0.05 s, time:")
-                run = pc.finished(SCENE + STEPS + scheme + ESTIMATE)
-                self.assertGreaterEqual(self.bracketed(bars(run), fine, "time"), 0.9 * len(NUMBERS))
+                self.assertGreaterEqual(self.bracketed(bars(estimated(*scheme)), fine, "time"), 0.9 * len(NUMBERS))
 
     def test_bars_in_space(self):
         """Against cells a quarter of the size; steps are the same."""
@@ -54,7 +60,7 @@ class ErrorEstimate(unittest.TestCase):
 
     def test_levels_and_the_run_itself(self):
         plain = pc.finished(SCENE + STEPS)
-        with_bars = pc.finished(SCENE + STEPS + ESTIMATE)
+        with_bars = estimated()
         before, after = plain.json(), with_bars.json()
         for key in NUMBERS:
             self.assertEqual(after[key], before[key])
@@ -85,7 +91,7 @@ class ErrorEstimate(unittest.TestCase):
         self.assertEqual([run["runs"][i]["cells"] for i in (0, 1)], [192, 24])
 
     def test_ranks(self):
-        one, two = (bars(pc.finished(SCENE + STEPS + ESTIMATE, ranks=n)) for n in (1, 2))
+        one, two = bars(estimated()), bars(pc.finished(SCENE + STEPS + ESTIMATE, ranks=2))
         for key in NUMBERS:
             for part in ("time", "space"):
                 self.assertAlmostEqual(one[key][part], two[key][part], delta=1e-6 * abs(one[key]["value"]) + 1e-9)
@@ -134,7 +140,7 @@ class ErrorEstimate(unittest.TestCase):
         """Asked for at the restart only: the bars of the whole run."""
         first = pc.finished(SCENE + STEPS + ["-checkpoint_every", "0.4"])
         again = pc.finished(SCENE + STEPS + ESTIMATE + ["-restart", first.path("checkpoint_previous.h5")])
-        whole = bars(pc.finished(SCENE + STEPS + ESTIMATE))
+        whole = bars(estimated())
         for key in NUMBERS:
             self.assertAlmostEqual(bars(again)[key]["error"], whole[key]["error"], delta=1e-6 * abs(whole[key]["value"]) + 1e-12)
 

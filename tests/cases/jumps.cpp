@@ -52,17 +52,11 @@ struct Jump {
   }
 };
 
-class JumpEffect final : public Effect {
+class JumpEffect final : public TestEffect {
 public:
   JumpEffect(double permeability, double mu) : parameters_{permeability, mu, middle} {}
   const char *name() const override { return "test_jump"; }
   const char *about() const override { return "coefficients that jump (test)"; }
-  bool active() const override { return true; }
-  PetscErrorCode declare(Options &options) override
-  {
-    options.group(name(), about());
-    return PETSC_SUCCESS;
-  }
   PetscErrorCode terms(Composition &c, const SceneFacts &) const override
   {
     using P = Jump::Parameters;

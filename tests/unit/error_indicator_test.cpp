@@ -2,7 +2,7 @@
 #include "pulmo/error_indicator.hpp"
 
 #include "unit/scenes.hpp"
-#include "verification/support/fields.hpp"
+#include "verification/support/error_norms.hpp"
 
 #include <algorithm>
 #include <array>
@@ -12,8 +12,6 @@ using namespace pulmo;
 using namespace pulmo::test;
 
 namespace {
-
-constexpr double mm3_kPa = 1e-6; ///< J
 
 /// A displacement and a pressure with their gradients.
 struct Field {
@@ -127,25 +125,12 @@ PetscErrorCode compare(const Field &field, int levels, CellErrors &estimate, Cel
   truth.flow.assign(n_cells, 0);
   truth.stress = truth.dissipation = 0;
   PetscCall(each_point([&](std::size_t c, const test::Sample &s) {
-    PointState exact, computed;
-    PetscScalar P[9], P_h[9], flux[3] = {0, 0, 0}, flux_h[3] = {0, 0, 0};
-    const auto grad_u = field.grad_u(s.x);
-    const auto grad_p = field.grad_p(s.x);
-    make_point_state(grad_u.data(), nullptr, exact);
-    make_point_state(s.grad_u, nullptr, computed);
-    law.stress(exact, P);
-    law.stress(computed, P_h);
-    truth.stress += s.weight * mm3_kPa * contract(P, P) / (2 * run.model().modulus());
-    for (int i = 0; i < 9; ++i) P[i] -= P_h[i];
-    truth.tissue[c] += s.weight * mm3_kPa * contract(P, P) / (2 * run.model().modulus());
-    for (int i = 0; i < 9; ++i) {
-      flux[i / 3] += computed.cof_F[i] * (grad_p[i % 3] - s.grad_p[i % 3]);
-      flux_h[i / 3] += computed.cof_F[i] * s.grad_p[i % 3];
-    }
-    for (int i = 0; i < 3; ++i) {
-      truth.flow[c] += s.weight * mm3_kPa * k / computed.J * flux[i] * flux[i];
-      truth.dissipation += s.weight * mm3_kPa * k / computed.J * flux_h[i] * flux_h[i];
-    }
+    const ErrorDensity e =
+        error_density(law, run.model().modulus(), k, s, field.grad_u(s.x).data(), field.grad_p(s.x).data());
+    truth.tissue[c] += s.weight * e.tissue;
+    truth.flow[c] += s.weight * e.flow;
+    truth.stress += s.weight * e.stress;
+    truth.dissipation += s.weight * e.dissipation;
   }));
   PetscFunctionReturn(PETSC_SUCCESS);
 }

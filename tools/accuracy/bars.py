@@ -16,6 +16,7 @@ from benchmarks.common import SCENES, SOLVERS, SOURCE, environment, fail, markdo
 
 from . import truth
 from .numbers import short
+from .sphere import ROLLERS, exact, octant
 
 NUMBERS = ["tidal_volume_ml", "peak_flow_ml_per_s", "peak_expiratory_flow_ml_per_s", "compliance_ml_per_cmH2O",
            "resistance_cmH2O_s_per_l", "time_constant_s", "work_j", "auto_peep_cmH2O",
@@ -23,8 +24,6 @@ NUMBERS = ["tidal_volume_ml", "peak_flow_ml_per_s", "peak_expiratory_flow_ml_per
 SCHEMES = {"backward Euler": [], "BDF2": ["-ts_type", "bdf"]}
 QUIET = ["-progress", "off", "-energy_audit", "off"]
 LAWS = ["berger", "ma", "birzle", "yoshihara", "rausch"]
-ROLLERS = ["-support", "-support_surfaces", "x0,y0,z0", "-support_components_x0", "x", "-support_components_y0", "y",
-           "-support_components_z0", "z"]
 
 
 class Study:
@@ -40,13 +39,13 @@ class Study:
             fail(f"{result['reason']}; see {result['folder']}")
         return result["summary"]
 
-    def compare(self, scene, part, bars, truth):
-        """A row for each number that the scene leaves free: bars[key] -> (value, bar), truth[key] -> value."""
+    def compare(self, scene, part, bars, true):
+        """A row for each number that the scene leaves free: bars[key] -> (value, bar), true[key] -> value."""
         for key in NUMBERS:
-            if key not in bars or truth.get(key) is None:
+            if key not in bars or true.get(key) is None:
                 continue
             value, bar = bars[key]
-            error = abs(value - truth[key])
+            error = abs(value - true[key])
             if bar is not None and max(bar, error) > 1e-9 * abs(value):
                 self.rows.append({"scene": scene, "part": part, "number": key, "value": value, "error": error, "bar": bar,
                                   "effectivity": bar / error if error else float("inf"), "held": bar >= error})
@@ -56,18 +55,12 @@ class Study:
         for scheme, words in SCHEMES.items():
             estimate = self.run([*options, "-ts_dt", str(dt), *words, "-error_estimate"])["error_estimate"]["numbers"]
             if steps:
-                truth = self.run([*options, "-ts_dt", str(dt / 32), *SCHEMES["BDF2"]])
-                self.compare(f"{scene}, {scheme}", "time", {k: (b["value"], b["time"]) for k, b in estimate.items()}, truth)
+                true = self.run([*options, "-ts_dt", str(dt / 32), *SCHEMES["BDF2"]])
+                self.compare(f"{scene}, {scheme}", "time", {k: (b["value"], b["time"]) for k, b in estimate.items()}, true)
             if cells and scheme == "backward Euler":
                 coarse = self.run([*options, "-ts_dt", str(4 * dt)])
-                truth = self.run([*options, "-ts_dt", str(4 * dt), "-dm_refine", "2"])
-                self.compare(scene, "space", {k: (coarse[k], b["space"]) for k, b in estimate.items()}, truth)
-
-
-def octant_numbers():
-    """Clinical numbers of an octant of the sphere by the radial solver: an eighth of the gas, eight times the resistance."""
-    shares = {"resistance_cmH2O_s_per_l": 8, "time_constant_s": 1}
-    return {key: value * shares.get(key, 1 / 8) for key, value in truth.numbers().items()}
+                true = self.run([*options, "-ts_dt", str(4 * dt), "-dm_refine", "2"])
+                self.compare(scene, "space", {k: (coarse[k], b["space"]) for k, b in estimate.items()}, true)
 
 
 def block(study):
@@ -87,24 +80,18 @@ def lung(study):
 
 
 def sphere(study):
-    exact = octant_numbers()
-
-    def mesh(divisions):
-        path = study.folder / f"octant_{divisions}.msh"
-        if not path.exists():
-            subprocess.run([SOURCE / "tools/sphere_mesh", "--octant", "--divisions", str(divisions), "--layers",
-                            str(3 * divisions), "--output", path], check=True, stdout=subprocess.DEVNULL)
-        return path
-
+    numbers = truth.numbers()
+    true = {key: exact(key, numbers) for key in numbers}
+    meshes = {divisions: octant(study.folder, divisions)[0] for divisions in (4, 6)}
     for scheme, words in SCHEMES.items():
         for dt in (0.1, 0.05):
             for divisions, other in ((6, 4), (4, 6)):
                 summary = study.run(["-options_file", SOLVERS / "direct.opts", "-options_file",
-                                     SCENES / "hollow_sphere.opts", *ROLLERS, "-dm_plex_filename", mesh(divisions),
-                                     "-ts_dt", str(dt), *words, "-error_estimate", "-error_estimate_mesh", mesh(other)])
+                                     SCENES / "hollow_sphere.opts", *ROLLERS, "-dm_plex_filename", meshes[divisions],
+                                     "-ts_dt", str(dt), *words, "-error_estimate", "-error_estimate_mesh", meshes[other]])
                 bars = {k: (b["value"], b["error"]) for k, b in summary["error_estimate"]["numbers"].items()}
-                study.compare(f"sphere, {summary['cells']} cells beside {mesh(other).stem.split('_')[1]} divisions, "
-                              f"{dt} s, {scheme}", "all", bars, exact)
+                study.compare(f"sphere, {summary['cells']} cells beside {other} divisions, "
+                              f"{dt} s, {scheme}", "all", bars, true)
 
 
 def manufactured(study):

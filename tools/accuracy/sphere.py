@@ -21,17 +21,14 @@ OCTANT = {"resistance_cmH2O_s_per_l": 8}  # a sphere's numbers by those of its o
 UNSCALED = {"time_constant_s"}
 
 
-def meshes(folder):
-    """The octants, made by tools/sphere_mesh unless they are there: the command that makes each, by path."""
-    folder.mkdir(parents=True, exist_ok=True)
-    made = {}
-    for n in LEVELS:
-        path = folder / f"octant_{n}.msh"
-        tool, *words = ["tools/sphere_mesh", "--divisions", str(n), "--layers", str(3 * n), "--octant", "--output", str(path)]
-        if not path.exists():
-            subprocess.run([SOURCE / tool, *words], check=True, stdout=subprocess.DEVNULL)
-        made[path] = shlex.join([tool, *words])
-    return made
+def octant(folder, divisions):
+    """An octant's mesh, made by tools/sphere_mesh unless it is there: its path and the command that makes it."""
+    path = folder / f"octant_{divisions}.msh"
+    tool, *words = ["tools/sphere_mesh", "--divisions", str(divisions), "--layers", str(3 * divisions), "--octant", "--output", str(path)]
+    if not path.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        subprocess.run([SOURCE / tool, *words], check=True, stdout=subprocess.DEVNULL)
+    return path, shlex.join([tool, *words])
 
 
 def exact(key, numbers):
@@ -167,7 +164,7 @@ def factors(search, tolerances=(0.01, 0.001)):
 def run(folder, results, build):
     """Makes the runs, and writes the tool's page, truth.md, tables and a figure to the folder."""
     numbers = truth.numbers()
-    made = meshes(results / "meshes")
+    made = dict(octant(results / "meshes", divisions) for divisions in LEVELS)
     search, _ = command.explore(["hollow_sphere", "--meshes", *map(str, made), "--budget", "6min", "--clock", "cpu", "--solvers", "iterative",
                                  "--numbers", *(a for a in ALIASES if a != "PIP"), "--output", str(folder), "--results", str(results), *build,
                                  "--", *ROLLERS], made)

@@ -3,6 +3,7 @@
 #include "verification/support/history.hpp"
 #include "verification/support/lattice.hpp"
 #include "verification/support/refinement.hpp"
+#include "verification/support/scene_parts.hpp"
 
 using namespace pulmo;
 using namespace pulmo::test;
@@ -12,16 +13,10 @@ namespace {
 constexpr double load = 1e-4, t_end = 0.2; ///< kPa; c_v t/a^2
 
 /// A pressure on surface `side` that keeps the direction of the reference normal: at these strains as good as any.
-class PressedSurface final : public Effect {
+class PressedSurface final : public TestEffect {
 public:
   const char *name() const override { return "pressed_surface"; }
   const char *about() const override { return "normal load (verification)"; }
-  PetscErrorCode declare(Options &options) override
-  {
-    options.group(name(), about());
-    return PETSC_SUCCESS;
-  }
-  bool active() const override { return true; }
   PetscErrorCode terms(Composition &c, const SceneFacts &) const override
   {
     c.surface_residual("load N", "side", displacement, surface_residual<NoParameters, press>, nullptr);

@@ -42,16 +42,10 @@ struct Breath {
   }
 };
 
-class BreathLoads final : public Effect {
+class BreathLoads final : public TestEffect {
 public:
   const char *name() const override { return "manufactured"; }
   const char *about() const override { return "loads of a manufactured breath (verification)"; }
-  PetscErrorCode declare(Options &options) override
-  {
-    options.group(name(), about());
-    return PETSC_SUCCESS;
-  }
-  bool active() const override { return true; }
   PetscErrorCode terms(Composition &c, const SceneFacts &) const override
   {
     using S = mms::Sources<Law, Breath>;

@@ -73,6 +73,16 @@ struct Dual {
   }
 };
 
+/// N variables: numbers whose derivative by themselves is 1.
+template <class T, int N>
+void seed(const T value[], Dual<T, N> (&variable)[N])
+{
+  for (int i = 0; i < N; ++i) {
+    variable[i].v = value[i];
+    variable[i].d[i] = T(1.0);
+  }
+}
+
 using std::cos;
 using std::exp;
 using std::log;

@@ -161,10 +161,7 @@ template <class Law, class T>
 void effective_stress(const T F[9], T P[9])
 {
   Dual<T, 9> seeded[9];
-  for (int i = 0; i < 9; ++i) {
-    seeded[i].v = F[i];
-    seeded[i].d[i] = T(1.0);
-  }
+  seed(F, seeded);
   const Dual<T, 9> W = energy<Law>(seeded);
   for (int i = 0; i < 9; ++i) P[i] = W.d[i];
 }
@@ -174,12 +171,11 @@ State state(double t, const double x[3])
 {
   using D = Dual<double, 4>; // derivatives by x, y, z, t
   using DD = Dual<D, 4>;     // and once more
+  const double at[4] = {x[0], x[1], x[2], t};
+  D once[4];
   DD X[4], u[3];
-  for (int i = 0; i < 4; ++i) {
-    X[i].v.v = i < 3 ? x[i] : t;
-    X[i].v.d[i] = 1;
-    X[i].d[i].v = 1;
-  }
+  seed(at, once);
+  seed(once, X);
   Solution::displacement(X, u);
   const DD p = Solution::pressure(X);
 
@@ -226,12 +222,9 @@ State state(double t, const double x[3])
 template <class Solution>
 double J_of(double t, const double x[3])
 {
-  using D = Dual<double, 4>;
-  D X[4], u[3];
-  for (int i = 0; i < 4; ++i) {
-    X[i].v = i < 3 ? x[i] : t;
-    X[i].d[i] = 1;
-  }
+  const double at[4] = {x[0], x[1], x[2], t};
+  Dual<double, 4> X[4], u[3];
+  seed(at, X);
   Solution::displacement(X, u);
   double F[9], cof[9];
   for (int i = 0; i < 3; ++i)

@@ -12,7 +12,7 @@
 #include "pulmo/error_indicator.hpp"
 #include "support/scene.hpp"
 #include "verification/mms/sources.hpp"
-#include "verification/support/fields.hpp"
+#include "verification/support/error_norms.hpp"
 #include "verification/support/integrators.hpp"
 #include "verification/support/scene_parts.hpp"
 
@@ -26,17 +26,11 @@ using namespace pulmo::test;
 namespace {
 
 template <class Law, class Solution>
-class ManufacturedLoads final : public Effect {
+class ManufacturedLoads final : public TestEffect {
 public:
   explicit ManufacturedLoads(bool weak) : weak_(weak) {}
   const char *name() const override { return "manufactured"; }
   const char *about() const override { return "loads of a manufactured solution (verification)"; }
-  PetscErrorCode declare(Options &options) override
-  {
-    options.group(name(), about());
-    return PETSC_SUCCESS;
-  }
-  bool active() const override { return true; }
   PetscErrorCode terms(Composition &c, const SceneFacts &) const override
   {
     using S = mms::Sources<Law, Solution>;
@@ -111,7 +105,6 @@ PetscErrorCode errors(pulmo::Run &run, Vec local, double t, Errors &e)
 {
   const DM dm = run.model().dm();
   const TissueLaw &law = run.scene().tissue().law();
-  constexpr double J = 1e-6; // per kPa mm^3
   ErrorIndicator indicator(run.scene(), run.model());
   CellErrors estimate;
 
@@ -125,19 +118,10 @@ PetscErrorCode errors(pulmo::Run &run, Vec local, double t, Errors &e)
     for (int i = 0; i < 9; ++i) e.grad_u += s.weight * square(s.grad_u[i] - grad_u[i]);
     e.p += s.weight * square(s.p - p);
     for (int i = 0; i < 3; ++i) e.grad_p += s.weight * square(s.grad_p[i] - grad_p[i]);
-    PointState exact, computed;
-    PetscScalar P[9], P_h[9];
-    make_point_state(grad_u, nullptr, exact);
-    make_point_state(s.grad_u, nullptr, computed);
-    law.stress(exact, P);
-    law.stress(computed, P_h);
-    for (int i = 0; i < 9; ++i) e.tissue += J * s.weight * square(P[i] - P_h[i]) / (2 * run.model().modulus());
-    const double k = mms::RationalPermeability::permeability(computed.J, {}).k;
-    for (int i = 0; i < 3; ++i) {
-      double flux = 0;
-      for (int j = 0; j < 3; ++j) flux += computed.cof_F[3 * i + j] * (grad_p[j] - s.grad_p[j]);
-      e.flow += J * s.weight * k / computed.J * square(flux);
-    }
+    const double k = mms::RationalPermeability::permeability(s.J(), {}).k;
+    const ErrorDensity in_norms = error_density(law, run.model().modulus(), k, s, grad_u, grad_p);
+    e.tissue += s.weight * in_norms.tissue;
+    e.flow += s.weight * in_norms.flow;
   }));
   PetscCall(indicator.setup());
   PetscCall(indicator.estimate(local, estimate));

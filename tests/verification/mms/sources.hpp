@@ -90,11 +90,9 @@ template <class Solution>
 void values(double t, const double x[3], double u[3], double grad_u[9], double &p, double grad_p[3])
 {
   using D = Dual<double, 4>;
+  const double at[4] = {x[0], x[1], x[2], t};
   D X[4], U[3];
-  for (int i = 0; i < 4; ++i) {
-    X[i].v = i < 3 ? x[i] : t;
-    X[i].d[i] = 1;
-  }
+  seed(at, X);
   Solution::displacement(X, U);
   const D pressure_value = Solution::pressure(X);
   p = pressure_value.v;

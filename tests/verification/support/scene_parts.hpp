@@ -10,8 +10,19 @@
 
 namespace pulmo::test {
 
+/// An effect that is always on and has no options.
+class TestEffect : public Effect {
+public:
+  PetscErrorCode declare(Options &options) final
+  {
+    options.group(name(), about());
+    return PETSC_SUCCESS;
+  }
+  bool active() const final { return true; }
+};
+
 /// Prescribes values of a field on one surface: all components, or those named by letters of "xyz".
-class Essential final : public Effect {
+class Essential final : public TestEffect {
 public:
   using Value = std::function<void(PetscReal t, const PetscReal x[3], PetscScalar value[3])>;
 
@@ -20,12 +31,6 @@ public:
   {}
   const char *name() const override { return "test_essential"; }
   const char *about() const override { return "prescribed field on a surface (verification)"; }
-  PetscErrorCode declare(Options &options) override
-  {
-    options.group(name(), about());
-    return PETSC_SUCCESS;
-  }
-  bool active() const override { return true; }
   PetscErrorCode terms(Composition &c, const SceneFacts &) const override
   {
     Constraint hold;
