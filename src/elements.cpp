@@ -29,6 +29,14 @@ PetscErrorCode Elements::declare(Options &options)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+const char *Elements::name() const
+{
+  const auto mine = [this](const Pair &pair) {
+    return pair.degrees.displacement == displacement && pair.degrees.pressure == pressure;
+  };
+  return std::find_if(pairs.begin(), pairs.end(), mine)->name;
+}
+
 PetscErrorCode nodes_at(DM dm, PetscInt point, PetscInt n, std::vector<ElementNode> &nodes)
 {
   DMPolytopeType type;

@@ -3,6 +3,7 @@
 #include "pulmo/checkpoint.hpp"
 
 #include <algorithm>
+#include <cstring>
 
 namespace pulmo {
 
@@ -105,6 +106,50 @@ PetscErrorCode warn_of_no_air(MPI_Comm comm, const Scene &scene, const Simulatio
                     "(-airflow_porosity %g), so that there would be less than no air; from there on the numbers mean "
                     "nothing. What to try: less suction, -tissue berger, a larger -airflow_porosity\n",
                     (double)row.time, (double)row.min_J, (double)least, (double)scene.airflow().porosity()));
+    break;
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Permeability of the tissue at rest, mm^2/(kPa s): what a gradient of pressure of 1 kPa/mm dissipates in 1 s.
+PetscErrorCode permeability_at_rest(const Scene &scene, const Model &model, PetscReal &permeability)
+{
+  const PetscScalar H[9] = {0}, zero[3] = {0, 0, 0}, gradient[3] = {1, 0, 0};
+  const PetscReal x[3] = {0, 0, 0};
+  Step second{};
+  PointState rest;
+  PetscDS ds;
+  const PetscScalar *constants;
+
+  PetscFunctionBeginUser;
+  second.dt = 1;
+  make_point_state(H, nullptr, rest);
+  PetscCall(DMGetDS(model.dm(), &ds));
+  PetscCall(PetscDSGetConstants(ds, nullptr, &constants));
+  const Point point{rest, zero, 0, gradient, 0, 0, x, x, second};
+  permeability = scene.airflow().dissipation()(point, point, constants);
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Elements of equal order are not stable where the tissue is undrained: in steps in which pressure spreads by less
+/// than half a cell, k M dt < (h/2)^2.
+PetscErrorCode warn_of_equal_order(MPI_Comm comm, const Scene &scene, const Model &model, const Simulation &simulation)
+{
+  const Elements &elements = scene.facts().elements;
+  const PetscReal half_edge = scene.mesh().length(); // an edge is about twice the mean cell size
+  PetscReal permeability = 0;
+
+  PetscFunctionBeginUser;
+  for (const Effect *effect : scene.active())
+    if (std::strcmp(effect->name(), "pressure_damping") == 0) PetscFunctionReturn(PETSC_SUCCESS);
+  if (!scene.facts().airflow || elements.displacement > elements.pressure) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(permeability_at_rest(scene, model, permeability));
+  for (const SignalRow &row : simulation.rows()) {
+    if (row.dt == 0 || permeability * model.modulus() * row.dt >= half_edge * half_edge) continue;
+    PetscCall(PetscPrintf(comm,
+                          "pulmo: warning: in the step of %g s at t = %g s pressure spreads by less than half a cell, "
+                          "where -elements %s is not stable: look for ripples, or give -pressure_damping\n",
+                          (double)row.dt, (double)row.time, elements.name()));
     break;
   }
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -247,6 +292,7 @@ PetscErrorCode run(const Registry &registry, bool &finished)
   }
   PetscCall(options.warn_unused());
   PetscCall(warn_of_no_air(comm, scene, simulation));
+  PetscCall(warn_of_equal_order(comm, scene, run.model(), simulation));
   if (view_effects) PetscCall(print_ledger(comm, scene, run.model(), simulation.seconds()));
   if (audit_energy) PetscCall(write_energy(comm, output, simulation, energy));
   if (!finished) {

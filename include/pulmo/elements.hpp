@@ -15,6 +15,7 @@ struct Elements {
 
   /// Declares -elements.
   PetscErrorCode declare(Options &options);
+  const char *name() const;
 };
 
 /// A node of an element: a mean of vertices of the mesh.

@@ -20,7 +20,7 @@ SCENES = {
     "no airflow, pins": PINS + ["-airflow", "off", "-tissue", "ma"],
     "quadrature degree 4": ["-quadrature_degree", "4"],
     "P1-P1": ["-elements", "P1-P1", "-pressure_damping"],
-    "P3-P2": ["-elements", "P3-P2", "-lumen_pressure"],
+    "P3-P2": ["-elements", "P3-P2", "-lumen_pressure", "-ventilator_ramp_down", "0.2"],
 }
 
 VENTILATORS = {
