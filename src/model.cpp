@@ -323,8 +323,7 @@ PetscErrorCode Model::find_airway(const std::vector<PetscInt> &constraint_of)
       PetscReal area;
       PetscCall(DMPlexComputeCellGeometryFVM(dm_, facet, &area, nullptr, nullptr));
       PetscCall(DMPlexGetTransitiveClosure(dm_, facet, PETSC_TRUE, &n_closure, &closure));
-      // the face, its edges, its vertices: a third each for the vertices of P1 and the edges of P2, nothing for the
-      // rest
+      // the face, its edges, its vertices: a third each for the vertices of P1, for the edges of P2
       const PetscInt first = composition().elements().pressure == 1 ? 4 : 1;
       for (PetscInt j = first; j < first + 3; ++j) share[closure[2 * j]] += area / 3;
       PetscCall(DMPlexRestoreTransitiveClosure(dm_, facet, PETSC_TRUE, &n_closure, &closure));

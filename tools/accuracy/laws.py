@@ -18,11 +18,11 @@ BUDGET = "100s"
 SHOWN = (0.1, 0.025)  # s, steps of the table
 
 
-def meshes(folder):
+def meshes(folder, sizes):
     """Meshes of the right lung of 1350 ml, coarse to fine."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
-    for size, airway in MESHES.items():
+    for size, airway in sizes.items():
         path = folder / f"right_{size:g}.msh"
         if not path.exists():
             subprocess.run([SOURCE / "tools/lung_mesh", "--side", "right", "--volume", "1350", "--bronchus-radius", "7", "--size", str(size),
@@ -101,7 +101,7 @@ def draw(path, searches):
 
 
 def run(folder, results, build):
-    paths = meshes(results / "meshes")
+    paths = meshes(results / "meshes", MESHES)
     searches = {law: search_of(law, paths, results, build) for law in LAWS}
     folder.mkdir(parents=True, exist_ok=True)
     made = {law: s for law, s in searches.items() if s.ladder.done}
