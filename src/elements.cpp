@@ -92,8 +92,21 @@ PetscErrorCode node_coordinates(DM dm, PetscInt point, PetscInt n, std::vector<s
 PetscErrorCode node_coordinates(DM dm, PetscInt point, PetscReal x[3])
 {
   std::vector<std::array<PetscReal, 3>> nodes;
+  PetscInt begin, end;
 
   PetscFunctionBeginUser;
+  PetscCall(DMPlexGetDepthStratum(dm, 0, &begin, &end));
+  if (point >= begin && point < end) {
+    PetscSection section;
+    Vec coordinates;
+    PetscInt offset;
+    PetscCall(DMGetCoordinateSection(dm, &section));
+    PetscCall(DMGetCoordinatesLocal(dm, &coordinates));
+    PetscCall(PetscSectionGetOffset(section, point, &offset));
+    const ReadArray values(coordinates);
+    std::copy_n(values.data() + offset, 3, x);
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
   PetscCall(node_coordinates(dm, point, 1, nodes));
   std::copy_n(nodes[0].begin(), 3, x);
   PetscFunctionReturn(PETSC_SUCCESS);

@@ -9,13 +9,18 @@
 
 namespace pulmo {
 
-PetscErrorCode Model::declare(Options &options)
+PetscErrorCode Model::declare(Options &options, const Elements &elements)
 {
+  const PetscInt k = elements.displacement;
+
   PetscFunctionBeginUser;
+  quadrature_degree_ = 2 * k - 1;
   options.group("quadrature", "integration (-petscfe_type pulmo|basic chooses the integrator)");
-  PetscCall(options.whole("degree", "-", Range::between(0, 8),
-                          "degree of the rule in the cells (0: 2 k - 1 for displacement of degree k, for P2 8 points)",
-                          quadrature_degree_));
+  PetscCall(
+      options.whole("degree", "-", Range::between(std::max<PetscReal>(1, 2 * k - 2), 8),
+                    "degree of the rule in the cells (2 k - 1 for displacement of degree k: for P2 8 points, exact "
+                    "for det F; 4: 14 points, for checks)",
+                    quadrature_degree_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -25,7 +30,6 @@ PetscErrorCode Model::build(Composition composition, PetscReal modulus)
   mesh_ = &composition.mesh();
   composition_ = std::make_unique<Composition>(std::move(composition));
   modulus_ = modulus;
-  if (quadrature_degree_ == 0) quadrature_degree_ = 2 * this->composition().elements().displacement - 1;
   PetscCall(DMClone(mesh_->dm(), dm_.out()));
   PetscCall(create_fields());
   PetscCall(create_weak_form());

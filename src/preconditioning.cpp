@@ -376,6 +376,7 @@ PetscErrorCode FixedStress::setup(DM dm, const Assembly &assembly)
     for (PetscInt i = 0; i < n; ++i) x[offset + i] = nodes[i / 3][i % 3];
     PetscCall(free_dofs(alone, global, p, 0, dofs, owned));
     if (dofs.empty()) continue;
+    PetscCheck(dofs.size() == 1, PETSC_COMM_SELF, PETSC_ERR_SUP, "several nodes of the pressure at a mesh point");
     PetscCall(PetscSectionGetFieldOffset(section, p, pressure, &offset));
     row[offset] = dofs[0];
     if (owned) point_row_[p] = dofs[0];

@@ -111,47 +111,23 @@ PetscErrorCode warn_of_no_air(MPI_Comm comm, const Scene &scene, const Simulatio
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-/// Permeability of the tissue at rest, mm^2/(kPa s): what a gradient of pressure of 1 kPa/mm dissipates in 1 s.
-PetscErrorCode permeability_at_rest(const Scene &scene, const Model &model, PetscReal &permeability)
-{
-  const PetscScalar H[9] = {0}, zero[3] = {0, 0, 0}, gradient[3] = {1, 0, 0};
-  const PetscReal x[3] = {0, 0, 0};
-  Step second{};
-  PointState rest;
-  PetscDS ds;
-  const PetscScalar *constants;
-
-  PetscFunctionBeginUser;
-  second.dt = 1;
-  make_point_state(H, nullptr, rest);
-  PetscCall(DMGetDS(model.dm(), &ds));
-  PetscCall(PetscDSGetConstants(ds, nullptr, &constants));
-  const Point point{rest, zero, 0, gradient, 0, 0, x, x, second};
-  permeability = scene.airflow().dissipation()(point, point, constants);
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-/// Elements of equal order are not stable where the tissue is undrained: in steps in which pressure spreads by less
-/// than half a cell, k M dt < (h/2)^2.
-PetscErrorCode warn_of_equal_order(MPI_Comm comm, const Scene &scene, const Model &model, const Simulation &simulation)
+/// Elements of equal order are not stable where the tissue is undrained: in steps @p dt (s) in which pressure spreads
+/// by less than half a cell, k M dt < (h/2)^2. Says so, once.
+PetscErrorCode warn_of_equal_order(MPI_Comm comm, const Scene &scene, const Model &model, PetscReal dt, bool &warned)
 {
   const Elements &elements = scene.facts().elements;
   const PetscReal half_edge = scene.mesh().length(); // an edge is about twice the mean cell size
-  PetscReal permeability = 0;
 
   PetscFunctionBeginUser;
+  if (warned || !scene.facts().airflow || elements.displacement > elements.pressure) PetscFunctionReturn(PETSC_SUCCESS);
   for (const Effect *effect : scene.active())
     if (std::strcmp(effect->name(), "pressure_damping") == 0) PetscFunctionReturn(PETSC_SUCCESS);
-  if (!scene.facts().airflow || elements.displacement > elements.pressure) PetscFunctionReturn(PETSC_SUCCESS);
-  PetscCall(permeability_at_rest(scene, model, permeability));
-  for (const SignalRow &row : simulation.rows()) {
-    if (row.dt == 0 || permeability * model.modulus() * row.dt >= half_edge * half_edge) continue;
+  warned = scene.airflow().permeability_at_rest() * model.modulus() * dt < half_edge * half_edge;
+  if (warned)
     PetscCall(PetscPrintf(comm,
-                          "pulmo: warning: in the step of %g s at t = %g s pressure spreads by less than half a cell, "
-                          "where -elements %s is not stable: look for ripples, or give -pressure_damping\n",
-                          (double)row.dt, (double)row.time, elements.name()));
-    break;
-  }
+                          "pulmo: warning: in a step of %g s pressure spreads by less than half a cell, where "
+                          "-elements %s is not stable: look for ripples, or give -pressure_damping\n",
+                          (double)dt, elements.name()));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -193,7 +169,7 @@ PetscErrorCode Run::declare()
 {
   PetscFunctionBeginUser;
   PetscCall(scene_.declare(options_));
-  PetscCall(model_.declare(options_));
+  PetscCall(model_.declare(options_, scene_.facts().elements));
   PetscCall(simulation_.declare(options_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -279,6 +255,8 @@ PetscErrorCode run(const Registry &registry, bool &finished)
   simulation.add(fields);
   if (output.progress()) simulation.add(progress);
   simulation.add(checkpoint);
+  bool warned_of_elements = false;
+  PetscCall(warn_of_equal_order(comm, scene, run.model(), simulation.wanted_dt(), warned_of_elements));
   const bool restarts = !checkpoint.restart().empty();
   if (restarts) PetscCall(checkpoint.restore());
   PetscCall(output.prepare(options, checkpoint.restart(), fields.files()));
@@ -292,7 +270,8 @@ PetscErrorCode run(const Registry &registry, bool &finished)
   }
   PetscCall(options.warn_unused());
   PetscCall(warn_of_no_air(comm, scene, simulation));
-  PetscCall(warn_of_equal_order(comm, scene, run.model(), simulation));
+  for (const SignalRow &row : simulation.rows()) // steps that were cut
+    if (row.dt > 0) PetscCall(warn_of_equal_order(comm, scene, run.model(), row.dt, warned_of_elements));
   if (view_effects) PetscCall(print_ledger(comm, scene, run.model(), simulation.seconds()));
   if (audit_energy) PetscCall(write_energy(comm, output, simulation, energy));
   if (!finished) {

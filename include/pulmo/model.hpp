@@ -16,8 +16,8 @@ namespace pulmo {
 /// neither field hides behind the other in the norm.
 class Model {
 public:
-  /// Declares -quadrature_degree.
-  PetscErrorCode declare(Options &options);
+  /// Declares -quadrature_degree; its default and least value are those of @p elements.
+  PetscErrorCode declare(Options &options, const Elements &elements);
   /// @p modulus: tissue stiffness that scales the equations, kPa. The composition's effects must outlive the model.
   PetscErrorCode build(Composition composition, PetscReal modulus);
 
@@ -122,7 +122,7 @@ private:
   Step step_{1, 0, 0, 1};
   PetscReal modulus_ = 1;
   std::vector<PetscReal> row_scale_;
-  PetscInt quadrature_degree_ = 0;
+  PetscInt quadrature_degree_ = 3;
   bool own_ = true;
   Assembly assembly_;
   FixedStress fixed_stress_;

@@ -27,6 +27,7 @@ VENTILATORS = {
     "vcv, uniform": ["-ventilator_flow_split", "uniform"],
     "vcv, common pressure": ["-ventilator_flow_split", "common_pressure"],
     "vcv, uniform, P3-P2": ["-ventilator_flow_split", "uniform", "-elements", "P3-P2"],
+    "vcv, common pressure, P3-P2": ["-ventilator_flow_split", "common_pressure", "-elements", "P3-P2"],
     "vcv, no airflow": ["-airflow", "off"],
     "vcv, no airflow, pins": PINS + ["-airflow", "off", "-tissue", "yoshihara"],
     "vcv, tube, lumen pressure": ["-tube", "-tube_k1", "2", "-tube_k2", "1000", "-lumen_pressure"],
@@ -144,9 +145,10 @@ class Parallel(unittest.TestCase):
             one = fields(pulmo.finished(short + ["-elements", pair]))
             three = fields(pulmo.finished(short + ["-elements", pair], ranks=3))
             for name, a, b in zip(("coordinates", "displacement", "pressure", "cells", "J"), one, three):
-                self.assertEqual(a.shape, b.shape)
-                self.assertGreater(np.abs(a).max(), 0)
-                np.testing.assert_allclose(a, b, rtol=0, atol=1e-9 * np.abs(a).max(), err_msg=f"{pair}: {name}")
+                with self.subTest(pair, values=name):
+                    self.assertEqual(a.shape, b.shape)
+                    self.assertGreater(np.abs(a).max(), 0)
+                    np.testing.assert_allclose(a, b, rtol=0, atol=1e-9 * np.abs(a).max())
 
 
 if __name__ == "__main__":

@@ -304,6 +304,9 @@ class Meshes(RestartCase):
             blocks.append((kind, cells[:, [1, 0] + list(range(2, cells.shape[1]))] + n, tags))
         mesh = case_meshes.save(np.vstack([self.points, mirrored]), blocks, self.names) + ["-mesh_scale", "1"]
         options = CUBE + TWICE + mesh + ["-checkpoint_every", "0.45"]
+        cubic = options + ["-elements", "P3-P2"]
+        once = pulmo.finished(cubic)
+        self.expect_same(once, pulmo.finished(cubic + ["-restart", once.path("checkpoint_previous.h5")], ranks=2), OTHER_RANKS, after=0.45)
         reference = pulmo.finished(options)
         other = pulmo.finished(options + ["-restart", reference.path("checkpoint_previous.h5")], ranks=2)
         with h5py.File(reference.path("checkpoint.h5")) as f:

@@ -28,11 +28,16 @@ def search_of(law, paths, results, build):
     return search
 
 
+def limit_of(search, key):
+    """The limit in space; None if the scene lacks the number."""
+    e = search.all_errors().get(key)
+    return e and e.limits["space"]
+
+
 def in_space(search, key):
     """Mesh -> error in space, a share of the limit."""
-    e = search.all_errors()[key]
-    limit = e.limits["space"].value
-    return {m: e.parts[m] / limit for m in search.axes.meshes if m in e.parts}
+    e = search.all_errors().get(key)
+    return {m: e.parts[m] / limit_of(search, key).value for m in search.axes.meshes if m in e.parts} if e else {}
 
 
 def runs_by_mesh(search):
@@ -41,38 +46,40 @@ def runs_by_mesh(search):
     return {s.mesh: run for s, run in search.ladder.done.items() if (s.steps, s.solver) == (base.steps, base.solver)}
 
 
+def rows(searches):
+    """One for each law, mesh and pair: cells, dofs, CPU s, errors of the numbers in %, None where there is none."""
+    return [[LAWS[law][0], mesh.elements, mesh.cells, run.summary["dofs"], run.cpu, run.summary["rejected_steps"],
+             *(100 * errors[mesh] if mesh in (errors := in_space(search, key)) else None for key in KEYS)]
+            for law, search in searches.items() for mesh in search.axes.meshes if (run := runs_by_mesh(search).get(mesh))]
+
+
 def table(searches):
     """A row for each mesh and pair: errors of the numbers by law."""
-    header = ["elements", "tets", "dofs", "CPU s", *(f"{LAWS[law][0]}: {', '.join(map(short, KEYS))} off by %" for law in searches)]
-    rows = []
-    first = next(iter(searches.values()))
-    for mesh in first.axes.meshes:
-        made = {law: runs_by_mesh(s).get(mesh) for law, s in searches.items()}
-        some = [run for run in made.values() if run]
-        if not some:
-            continue
-        row = [mesh.elements, mesh.cells, some[0].summary["dofs"], f"{statistics.median(run.cpu for run in some):.3g}"]
-        for law, run in made.items():
-            row.append(" ".join(f"{100 * in_space(searches[law], key)[mesh]:+.2g}" for key in KEYS) if run else "-")
-        rows.append(row)
-    return header, rows
+    laws_ = [LAWS[law][0] for law in searches]
+    header = ["elements", "tets", "dofs", "CPU s", *(f"{law}: {', '.join(map(short, KEYS))} off by %" for law in laws_)]
+    made = {}
+    for law, pair, cells, dofs, cpu, _, *errors in rows(searches):
+        made.setdefault((pair, cells, dofs), {})[law] = cpu, " ".join(text(error, "{:+.2g}") for error in errors)
+    return header, [[*key, f"{statistics.median(cpu for cpu, _ in of.values()):.3g}" + (f" ({len(of)} laws)" if len(of) < len(laws_) else ""),
+                     *(of[law][1] if law in of else "-" for law in laws_)]
+                    for key, of in sorted(made.items(), key=lambda item: (ELEMENTS.index(item[0][0]), item[0][1]))]
 
 
-def uncertainties(searches):
-    """What the limits in space may be off, %, by law."""
-    return "; ".join(f"{LAWS[law][0]} " + ", ".join(f"{short(key)} {100 * e.limits['space'].uncertainty / abs(e.limits['space'].value):.2g}"
-                                                 for key in KEYS if (e := search.all_errors()[key]))
-                     for law, search in searches.items())
+def limits_table(searches):
+    """Limits in space, what they may be off and whose they are."""
+    return ["law", "number", "limit", "± %", "from"], [
+        [LAWS[law][0], short(key), f"{found.value:.5g}", f"{100 * found.uncertainty / abs(found.value):.2g}", found.how]
+        for law, search in searches.items() for key in KEYS if (found := limit_of(search, key))]
 
 
 def factors(searches):
-    """Table: CPU seconds of each pair to an error in space, by number and law."""
+    """Table: CPU seconds of each pair to an error in space, by number and law; no ratio where the limit is in doubt by half of that."""
     header = ["law", "number", "error in space", *(f"{pair}: CPU s" for pair in ELEMENTS), "P2-P1 over P1-P1"]
-    rows = []
+    made = []
     for law, search in searches.items():
         runs = runs_by_mesh(search)
         for key in KEYS:
-            errors = in_space(search, key)
+            found, errors = limit_of(search, key), in_space(search, key)
             for wanted in WANTED:
                 costs = {pair: cost_at([(runs[m].cpu, abs(error)) for m, error in errors.items() if m.elements == pair], wanted)
                          for pair in ELEMENTS}
@@ -80,9 +87,10 @@ def factors(searches):
                 if two is None and one is None:
                     continue
                 told = ["-" if cost is None else ("≤ " if at_most else "") + f"{cost:.2g}" for cost, at_most in costs.values()]
+                doubtful = found.uncertainty > wanted / 2 * abs(found.value)
                 ratio = None if None in (two, one) or bound or other else two / one
-                rows.append([LAWS[law][0], short(key), f"{100 * wanted:g} %", *told, text(ratio, "{:.1f}")])
-    return header, rows
+                made.append([LAWS[law][0], short(key), f"{100 * wanted:g} %", *told, "limit in doubt" if doubtful else text(ratio, "{:.1f}")])
+    return header, made
 
 
 def draw(path, searches):
@@ -103,15 +111,17 @@ def draw(path, searches):
     save(figure, path, "Error in space over cost: full P2-P1, hollow P1-P1, squares P3-P2; built-in right lung, PCV")
 
 
-def fields_table(search):
-    """Errors of the fields of one law, against the run with the most unknowns."""
+def fields_lines(search):
+    """Errors of the fields of one law, in words and a table."""
     found, reference = page.field_errors(search)
-    rows = []
-    for setting, run in search.ladder.done.items():
-        if setting in found:
-            rows.append([setting.mesh.elements, setting.mesh.cells, run.summary["dofs"], f"{run.cpu:.3g}",
-                         *(f"{100 * found[setting][k]:.2g}" for k in ("u L2", "u H1", "p L2"))])
-    return ["elements", "tets", "dofs", "CPU s", "u: L2 %", "u: H1 %", "p: L2 %"], rows, reference
+    if not found:
+        return ["Not compared: a run left none."]
+    run, time = reference
+    table_ = [[s.mesh.elements, s.mesh.cells, r.summary["dofs"], f"{r.cpu:.3g}", *(f"{100 * found[s][k]:.2g}" for k in ("u L2", "u H1", "p L2"))]
+              for s, r in search.ladder.done.items() if s in found]
+    return [f"At {time:g} s, relative errors against {run.setting.mesh.name} ({run.summary['dofs']} dofs), which has errors of its own. Of P3 "
+            "displacement the files hold the quadratic part.", "",
+            *markdown(["elements", "tets", "dofs", "CPU s", "u: L2 %", "u: H1 %", "p: L2 %"], table_)]
 
 
 def run(folder, results, build):
@@ -119,23 +129,23 @@ def run(folder, results, build):
     searches = {law: search_of(law, paths, results, build) for law in LAWS}
     folder.mkdir(parents=True, exist_ok=True)
     made = {law: s for law, s in searches.items() if s.ladder.done}
-    header, rows = table(made)
-    write_csv(folder / "elements.csv", header, rows)
+    write_csv(folder / "elements.csv", ["law", "elements", "cells", "dofs", "cpu_s", "rejected_steps", *(f"error_{key}_percent" for key in KEYS)],
+              [[*row[:4], f"{row[4]:.3g}", row[5], *(text(error, "{:.4g}") for error in row[6:])] for row in rows(made)])
     f_header, f_rows = factors(made)
     write_csv(folder / "factors.csv", f_header, f_rows)
     draw(folder / "elements.png", made)
-    u_header, u_rows, reference = fields_table(made["birzle"])
-    ratios = sorted(float(row[-1]) for row in f_rows if row[-1] != "-")
+    ratios = sorted(float(row[-1]) for row in f_rows if row[-1][0].isdigit())
     left_out = [f"- {LAWS[law][0]}, {setting.name}: {why}" for law, s in searches.items() for setting, why in
                 [*((t, why) for t, (why, _) in s.ladder.failed.items()), *s.ladder.skipped.items()]]
     lines = ["# Elements: error in space over cost", "", "    tools/accuracy_study elements", "",
              "PCV with `-ventilator_ramp_down 0.1`, built-in right lung, backward Euler with Δt 0.1 s; CM1 with `-lumen_pressure`, CM5 with `reuse.opts`, the "
-             "others with `iterative.opts`. Errors against the limit of the surest ladder; CPU seconds of one core, the median of the laws.",
-             "", "![elements](elements.png)", "", *markdown(header, rows), "", f"What the limits may be off, %: {uncertainties(made)}.", "",
-             "## CPU seconds to an error", "", "Interpolated between runs; ≤: the cheapest level meets it already, no ratio is given then; -: not reached.", "",
+             "others with `iterative.opts`. CPU seconds of one core, the median of the laws (of those that finished where that is told). "
+             "Errors against the limit of the surest ladder, below.",
+             "", "![elements](elements.png)", "", *markdown(*table(made)), "", "## CPU seconds to an error", "",
+             "Interpolated between runs; ≤: the cheapest level meets it already, no ratio is given then; -: not reached.", "",
              *markdown(f_header, f_rows), "",
              (f"P2-P1 over P1-P1: {ratios[0]:.1f} to {ratios[-1]:.1f}, median {statistics.median(ratios):.1f} ({len(ratios)} ratios)." if ratios
-              else "No ratio is known."), "",
-             "## Fields", "", f"CM3 at {reference[1]:g} s, relative errors against {reference[0].setting.mesh.name} ({reference[0].summary['dofs']} dofs), "
-             "which has errors of its own.", "", *markdown(u_header, u_rows), "", "## Left out", "", *(left_out or ["Nothing."])]
+              else "No ratio is known."), "", "## The limits", "", *markdown(*limits_table(made)), "",
+             "## Fields (CM3)", "", *(fields_lines(made["birzle"]) if "birzle" in made else ["No run finished."]), "",
+             "## Left out", "", *(left_out or ["Nothing."])]
     (folder / "README.md").write_text("\n".join(lines) + "\n")

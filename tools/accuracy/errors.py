@@ -7,7 +7,7 @@ the smallest errors (the anchor) less its parts; its uncertainty is the sum of t
 A ladder of one level is not examined: its error is taken as 0 in the sums, and said to be missing wherever they are shown.
 """
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from .extrapolate import ROUNDING, Limit, limit
 from .settings import ORDERS, Setting
@@ -121,7 +121,8 @@ def in_space(values, axes):
         ladder = [(m.size(), values[s]) for m in axes.meshes
                   if m.elements == elements and (s := Setting(m, axes.base.steps, axes.base.solver)) in values]
         if ladder:
-            limits.append(limit(*zip(*ladder), 2))
+            found = limit(*zip(*ladder), 2)
+            limits.append(replace(found, how=f"{elements}: {found.how}") if elements else found)
     if len({m.cells for m in axes.meshes}) == 1 and limits:
         return Limit(limits[0].value, math.nan, None, 1, "one mesh given: not examined")
     return surest(limits, "elements")

@@ -13,13 +13,14 @@ FIGURES = {"ladders": pictures.ladders, "pareto": pictures.pareto, "costs": pict
 
 
 def field_errors(search):
-    """Errors of the fields by setting against the run with the smallest errors, at the snapshot with the most gas (runs without one
+    """Errors of the fields by setting against the run on the finest mesh, of those the one with the most unknowns, then with the smallest
+    errors (of P3 displacement the files hold the quadratic part alone), at the snapshot with the most gas (runs without one
     at that time are left out); and that run, None if there are no snapshots."""
     done = search.ladder.done
     errors = search.errors()
     if not errors or any(not (run.folder / "fields.xdmf").exists() for run in done.values()):
         return {}, None
-    reference = min(done.values(), key=lambda run: (-run.summary["dofs"], max(e.predicted(run.setting) for e in errors.values())))
+    reference = min(done.values(), key=lambda run: (-run.setting.mesh.cells, -run.summary["dofs"], max(e.predicted(run.setting) for e in errors.values())))
     volumes = benchmark_runs.waveform(reference.results[0])
     times = [time for time, *_ in fields.snapshots(reference.folder)]
     time = max(times, key=lambda t: volumes[min(volumes, key=lambda row: abs(row - t))][0])

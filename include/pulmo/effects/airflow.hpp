@@ -116,6 +116,8 @@ public:
   const char *about() const override { return "Darcy flow of alveolar air (mass balance, pressure field)"; }
   bool active() const override { return on_; }
   PetscReal porosity() const { return porosity_; }
+  /// Permeability over viscosity of the tissue at rest, mm^2/(kPa s).
+  PetscReal permeability_at_rest() const { return laws_[chosen_]->at_rest(); }
   /// Heat of the flow in a step, by point: quadratic in Grad p, kPa.
   EnergyDensity dissipation() const { return laws_[chosen_]->dissipation_callback(); }
 
