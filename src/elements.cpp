@@ -23,7 +23,7 @@ PetscErrorCode Elements::declare(Options &options)
   PetscFunctionBeginUser;
   for (const Pair &pair : pairs) names.emplace_back(pair.name);
   options.group("elements", "finite elements");
-  PetscCall(options.choice("", names, "degrees of displacement and pressure (P1-P1: with -pressure_damping)", wanted));
+  PetscCall(options.choice("", names, "degrees of displacement and pressure (docs/accuracy/elements.md)", wanted));
   const auto chosen = std::find(names.begin(), names.end(), wanted) - names.begin();
   *this = pairs[static_cast<std::size_t>(chosen)].degrees;
   PetscFunctionReturn(PETSC_SUCCESS);

@@ -136,7 +136,7 @@ class Known:
         failed, spent = failed or spent > timeout, min(spent, timeout)
         return {"code": int(failed), "reason": "it was to fail", "cpu": spent, "wall": spent, "memory": cells / 100, "kept": False,
                 "load": [0, 0], "folder": pathlib.Path("nowhere"),
-                "summary": values | {"breaths": [values], "steps": steps, "cells": cells, "dofs": 6 * cells}}
+                "summary": values | {"breaths": [values], "steps": steps, "cells": cells, "dofs": 6 * cells, "rejected_steps": 0}}
 
 
 class Searching(unittest.TestCase):
