@@ -73,10 +73,12 @@ PetscErrorCode Assembly::setup_cells()
   for (PetscInt c = 0; c < cells_; ++c) {
     PetscInt *closure = nullptr, n_closure, n = 0;
     std::vector<PetscInt> points;
+    const PetscInt **place_of; // [mesh point][dof]: its place as the cell sees it; null: as it is
     PetscCall(
         DMPlexComputeCellGeometryAffineFEM(dm_, first_cell_ + c, &v0_[3 * c], &J_[9 * c], &invJ_[9 * c], &detJ_[c]));
     PetscCall(DMPlexGetTransitiveClosure(dm_, first_cell_ + c, PETSC_TRUE, &n_closure, &closure));
-    for (PetscInt f = 0; f < n_fields_; ++f)
+    for (PetscInt f = 0; f < n_fields_; ++f) {
+      PetscCall(PetscSectionGetFieldPointSyms(section, f, n_closure, closure, &place_of, nullptr));
       for (PetscInt i = 0; i < n_closure; ++i) {
         const PetscInt point = closure[2 * i];
         PetscInt dof, offset;
@@ -85,15 +87,18 @@ PetscErrorCode Assembly::setup_cells()
         if (dof == 0) continue;
         auto place = std::find(points.begin(), points.end(), point);
         if (place == points.end()) place = points.insert(points.end(), point);
-        for (PetscInt d = 0; d < dof; ++d, ++n) {
-          PetscCheck(n < element_size_, PETSC_COMM_SELF, PETSC_ERR_PLIB, "closure larger than the element");
-          cell_dofs_[c * element_size_ + n] = offset + d;
+        PetscCheck(n + dof <= element_size_, PETSC_COMM_SELF, PETSC_ERR_PLIB, "closure larger than the element");
+        for (PetscInt d = 0; d < dof; ++d) {
+          cell_dofs_[c * element_size_ + n + (place_of && place_of[i] ? place_of[i][d] : d)] = offset + d;
           if (c == 0) {
             dof_point_.push_back(static_cast<PetscInt>(place - points.begin()));
             dof_field_.push_back(f);
           }
         }
+        n += dof;
       }
+      PetscCall(PetscSectionRestoreFieldPointSyms(section, f, n_closure, closure, &place_of, nullptr));
+    }
     PetscCall(DMPlexRestoreTransitiveClosure(dm_, first_cell_ + c, PETSC_TRUE, &n_closure, &closure));
     PetscCheck(n == element_size_, PETSC_COMM_SELF, PETSC_ERR_PLIB, "closure smaller than the element");
     points_per_cell_ = static_cast<PetscInt>(points.size());

@@ -222,8 +222,8 @@ PetscErrorCode Checkpoint::compare_options(const std::string &stored) const
     const auto here = value_in(now, name);
     if (!here || !Options::same_value(value, *here)) PetscCall(refuse(name));
   }
-  for (const auto &[name, value] : now)
-    if (!is_free(name) && !value_in(then, name)) PetscCall(refuse(name));
+  for (const auto &[name, value] : now) // an earlier pulmo did not have all options, and did what is the default now
+    if (!is_free(name) && !value_in(then, name) && !options_.at_default(name)) PetscCall(refuse(name));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -1,4 +1,4 @@
-// Field snapshots: HDF5 through PETSc's viewer, one XDMF index with quadratic tetrahedra.
+// Field snapshots: HDF5 through PETSc's viewer, one XDMF index with quadratic tetrahedra, whatever the elements.
 #include "pulmo/error_indicator.hpp"
 #include "pulmo/node_order.hpp"
 #include "pulmo/output.hpp"
@@ -30,6 +30,36 @@ PetscErrorCode write_values(PetscViewer viewer, const char *name, PetscInt compo
   PetscCall(VecCreateMPIWithArray(comm, components, (PetscInt)values.size(), PETSC_DETERMINE, values.data(), v.out()));
   PetscCall(PetscObjectSetName((PetscObject)(Vec)v, name));
   PetscCall(VecView(v, viewer));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// A field at a vertex or in the middle of an edge of @p dm, from a local vector; appended to @p values.
+PetscErrorCode append_at(DM dm, PetscInt point, PetscInt field, const PetscScalar *x, std::vector<PetscScalar> &values)
+{
+  PetscSection section;
+  PetscInt components, dof, offset, n_ends;
+  const PetscInt *ends;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMGetLocalSection(dm, &section));
+  PetscCall(PetscSectionGetFieldComponents(section, field, &components));
+  PetscCall(PetscSectionGetFieldDof(section, point, field, &dof));
+  PetscCall(PetscSectionGetFieldOffset(section, point, field, &offset));
+  PetscCall(DMPlexGetConeSize(dm, point, &n_ends));
+  PetscCall(DMPlexGetCone(dm, point, &ends));
+  if (n_ends == 0 || dof == components) { // a node of its own: a vertex, an edge of P2
+    values.insert(values.end(), x + offset, x + offset + components);
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+  // P1; P3 with the nodes of nodes_at()
+  const PetscScalar of_end = dof == 0 ? 1. / 2 : -1. / 8, of_inner = 5. / 8;
+  const std::size_t first = values.size();
+  values.resize(first + static_cast<std::size_t>(components), 0);
+  for (PetscInt d = 0; d < dof; ++d) values[first + d % components] += of_inner * x[offset + d];
+  for (PetscInt i = 0; i < n_ends; ++i) {
+    PetscCall(PetscSectionGetFieldOffset(section, ends[i], field, &offset));
+    for (PetscInt d = 0; d < components; ++d) values[first + d] += of_end * x[offset + d];
+  }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -155,7 +185,7 @@ PetscErrorCode FieldWriter::number_nodes()
 
   PetscFunctionBeginUser;
   PetscCall(DMPlexGetChart(dm, &begin, &end));
-  PetscCall(owned_nodes(dm, nodes_));
+  PetscCall(owned_points(dm, 2, nodes_));
   PetscCall(DMGetPointSF(dm, &sf));
   PetscCall(PetscSFGetGraph(sf, &roots, nullptr, nullptr, nullptr));
   const auto mine = static_cast<PetscInt>(nodes_.size());
@@ -232,8 +262,6 @@ PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
   const bool gas = scene_.facts().airflow;
   const Assembly &assembly = model_.assembly();
   const TissueLaw &law = scene_.tissue().law();
-  PetscSection section;
-  PetscInt vertex_begin, vertex_end;
   std::vector<PetscScalar> u, p, J, porosity, hydrostatic, von_mises;
   CellErrors errors;
   ViewerHandle viewer;
@@ -242,25 +270,9 @@ PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
   if (!snapshots_.empty() && snapshots_.back().time == time) PetscFunctionReturn(PETSC_SUCCESS);
   if (!mesh_written_) PetscCall(write_mesh());
   const ReadArray x(local);
-  PetscCall(DMGetLocalSection(dm, &section));
-  PetscCall(DMPlexGetDepthStratum(dm, 0, &vertex_begin, &vertex_end));
   for (PetscInt node : nodes_) {
-    PetscInt offset;
-    PetscCall(PetscSectionGetFieldOffset(section, node, displacement, &offset));
-    for (int d = 0; d < 3; ++d) u.push_back(x[offset + d]);
-    if (!gas) continue;
-    const PetscInt *ends = &node;
-    PetscInt n = 1;
-    PetscScalar mean = 0;
-    if (node < vertex_begin || node >= vertex_end) {
-      PetscCall(DMPlexGetCone(dm, node, &ends));
-      PetscCall(DMPlexGetConeSize(dm, node, &n));
-    }
-    for (PetscInt i = 0; i < n; ++i) {
-      PetscCall(PetscSectionGetFieldOffset(section, ends[i], pressure, &offset));
-      mean += x[offset] / n;
-    }
-    p.push_back(mean);
+    PetscCall(append_at(dm, node, displacement, x.data(), u));
+    if (gas) PetscCall(append_at(dm, node, pressure, x.data(), p));
   }
   // cell means over the quadrature points
   std::vector<PointState> states;

@@ -363,30 +363,4 @@ PetscErrorCode Mesh::facets(const std::string &name, std::vector<PetscInt> &poin
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode node_coordinates(DM dm, PetscInt point, PetscReal x[3])
-{
-  PetscInt vertex_begin, vertex_end;
-  PetscSection section;
-  Vec coordinates;
-
-  PetscFunctionBeginUser;
-  PetscCall(DMPlexGetDepthStratum(dm, 0, &vertex_begin, &vertex_end));
-  PetscCall(DMGetCoordinateSection(dm, &section));
-  PetscCall(DMGetCoordinatesLocal(dm, &coordinates));
-  const ReadArray values(coordinates);
-  const PetscInt *ends = &point;
-  PetscInt n = 1;
-  if (point < vertex_begin || point >= vertex_end) {
-    PetscCall(DMPlexGetCone(dm, point, &ends));
-    PetscCall(DMPlexGetConeSize(dm, point, &n));
-  }
-  for (int d = 0; d < 3; ++d) x[d] = 0;
-  for (PetscInt i = 0; i < n; ++i) {
-    PetscInt offset;
-    PetscCall(PetscSectionGetOffset(section, ends[i], &offset));
-    for (int d = 0; d < 3; ++d) x[d] += values[offset + d] / n;
-  }
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
 } // namespace pulmo

@@ -9,13 +9,18 @@
 
 namespace pulmo {
 
-PetscErrorCode Model::declare(Options &options)
+PetscErrorCode Model::declare(Options &options, const Elements &elements)
 {
+  const PetscInt k = elements.displacement;
+
   PetscFunctionBeginUser;
+  quadrature_degree_ = 2 * k - 1;
   options.group("quadrature", "integration (-petscfe_type pulmo|basic chooses the integrator)");
-  PetscCall(options.whole("degree", "-", Range::between(1, 8),
-                          "degree of the rule in the cells (3: 8 points, exact for det F; 4: 14 points, for checks)",
-                          quadrature_degree_));
+  PetscCall(
+      options.whole("degree", "-", Range::between(std::max<PetscReal>(1, 2 * k - 2), 8),
+                    "degree of the rule in the cells (2 k - 1 for displacement of degree k: for P2 8 points, exact "
+                    "for det F; 4: 14 points, for checks)",
+                    quadrature_degree_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -106,6 +111,9 @@ PetscErrorCode Model::create_fields()
     PetscCall(PetscFESetFromOptions(fe));
     PetscCall(PetscObjectTypeCompare((PetscObject)(PetscFE)fe, "pulmo", &own));
     own_ = own;
+    PulmoUserCheck(own_ || quadrature_degree_ > 1, comm,
+                   "-petscfe_type basic: PETSc has no room for the points of facets where cells have one; give "
+                   "-quadrature_degree 2 or leave basic out");
     PetscCall(DMSetField(dm_, index++, nullptr, (PetscObject)(PetscFE)fe));
     if (index == 1) PetscCall(DMGetField(dm_, 0, nullptr, (PetscObject *)&first));
   }
@@ -246,9 +254,11 @@ PetscErrorCode Model::create_section()
                                 bc_field.data(), bc_components.data(), bc_points.data(), nullptr, section.out()));
   for (PetscInt f = 0; f < n_fields; ++f) PetscCall(PetscSectionSetFieldName(section, f, fields[f].name.c_str()));
   if (composition().common_gas_pressure()) PetscCall(add_carrier(section));
+  PetscCall(add_symmetries(section));
   PetscCall(DMSetLocalSection(dm_, section));
 
   prescribed_.clear();
+  std::vector<std::array<PetscReal, 3>> x;
   for (PetscInt p = begin; p < end; ++p) {
     for (PetscInt c = 0; c < 4; ++c) {
       const PetscInt k = constraint_of[5 * p + c], f = c < 3 ? displacement : pressure;
@@ -257,12 +267,15 @@ PetscErrorCode Model::create_section()
       PetscCall(PetscSectionGetFieldDof(section, p, f, &dof));
       if (dof == 0) continue;
       PetscCall(PetscSectionGetFieldOffset(section, p, f, &offset));
-      Prescribed value{};
-      value.component = static_cast<std::int16_t>(c < 3 ? c : 0);
-      value.dof = offset + value.component;
-      value.constraint = static_cast<std::int16_t>(k);
-      PetscCall(mesh_->node_coordinates(p, value.x));
-      prescribed_.push_back(value);
+      PetscCall(node_coordinates(dm_, p, dof / components[f], x));
+      for (std::size_t node = 0; node < x.size(); ++node) {
+        Prescribed value{};
+        value.component = static_cast<std::int16_t>(c < 3 ? c : 0);
+        value.dof = offset + static_cast<PetscInt>(node) * components[f] + value.component;
+        value.constraint = static_cast<std::int16_t>(k);
+        std::copy(x[node].begin(), x[node].end(), value.x);
+        prescribed_.push_back(value);
+      }
     }
   }
   PetscCall(find_airway(constraint_of));
@@ -270,7 +283,27 @@ PetscErrorCode Model::create_section()
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-/// The airway's nodes, with their share of its area (of P1 basis functions).
+/// Where an edge has two nodes, cells see them in the order of their own corners.
+PetscErrorCode Model::add_symmetries(PetscSection section) const
+{
+  DMHandle plain;
+  PetscSection known;
+
+  PetscFunctionBeginUser;
+  if (composition().elements().displacement < 3) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(DMClone(mesh_->dm(), plain.out())); // PETSc knows them for the sections that it makes
+  PetscCall(DMCopyFields(dm_, plain));
+  PetscCall(DMCreateDS(plain));
+  PetscCall(DMGetLocalSection(plain, &known));
+  for (std::size_t f = 0; f < composition().fields().size(); ++f) {
+    PetscSectionSym symmetries;
+    PetscCall(PetscSectionGetFieldSym(known, static_cast<PetscInt>(f), &symmetries));
+    PetscCall(PetscSectionSetFieldSym(section, static_cast<PetscInt>(f), symmetries));
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// The airway's nodes, with their share of its area: the integrals of their basis functions.
 PetscErrorCode Model::find_airway(const std::vector<PetscInt> &constraint_of)
 {
   const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
@@ -282,7 +315,7 @@ PetscErrorCode Model::find_airway(const std::vector<PetscInt> &constraint_of)
   PetscCall(DMGetLocalSection(dm_, &section));
   PetscCall(DMGetGlobalSection(dm_, &global)); // made here, used by DMPlexGetPointGlobalField
   PetscCall(DMPlexGetChart(dm_, &begin, &end));
-  std::map<PetscInt, PetscReal> share; // of each vertex
+  std::map<PetscInt, PetscReal> share;
   std::set<std::string> surfaces;
   for (const Constraint &c : composition().constraints())
     if (c.at_airway) surfaces.insert(c.surface);
@@ -294,7 +327,9 @@ PetscErrorCode Model::find_airway(const std::vector<PetscInt> &constraint_of)
       PetscReal area;
       PetscCall(DMPlexComputeCellGeometryFVM(dm_, facet, &area, nullptr, nullptr));
       PetscCall(DMPlexGetTransitiveClosure(dm_, facet, PETSC_TRUE, &n_closure, &closure));
-      for (PetscInt j = n_closure - 3; j < n_closure; ++j) share[closure[2 * j]] += area / 3; // vertices come last
+      // the face, its edges, its vertices: a third each for the vertices of P1, for the edges of P2
+      const PetscInt first = composition().elements().pressure == 1 ? 4 : 1;
+      for (PetscInt j = first; j < first + 3; ++j) share[closure[2 * j]] += area / 3;
       PetscCall(DMPlexRestoreTransitiveClosure(dm_, facet, PETSC_TRUE, &n_closure, &closure));
     }
   }
@@ -544,7 +579,7 @@ PetscErrorCode Model::use_fixed_stress()
   PetscFunctionBeginUser;
   PulmoUserCheck(own_, PetscObjectComm((PetscObject)(DM)dm_),
                  "-pc_fieldsplit_schur_precondition user needs pulmo's own integration; leave -petscfe_type out");
-  PetscCall(fixed_stress_.setup(dm_));
+  PetscCall(fixed_stress_.setup(dm_, assembly_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

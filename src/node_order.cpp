@@ -1,6 +1,6 @@
 #include "pulmo/node_order.hpp"
 
-#include "pulmo/mesh.hpp"
+#include "pulmo/elements.hpp"
 
 #include <algorithm>
 #include <array>
@@ -14,7 +14,7 @@ namespace pulmo {
 namespace {
 
 struct Key {
-  std::int64_t depth;  ///< 0: vertex, 1: edge
+  std::int64_t depth;  ///< 0: vertex, 1: edge, 2: face
   double x[3];         ///< mm
   std::uint64_t cells; ///< of the cells around it
 
@@ -82,6 +82,47 @@ PetscErrorCode hash_cells(DM dm, std::vector<std::uint64_t> &around)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+/// Up to which dimension mesh points carry nodes: 2, or 3 if faces do.
+PetscErrorCode highest_dimension(DM dm, PetscInt &dimension)
+{
+  PetscSection section;
+  PetscInt begin, end, dof, most = 0;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMGetLocalSection(dm, &section));
+  PetscCall(DMPlexGetDepthStratum(dm, 2, &begin, &end));
+  for (PetscInt p = begin; p < end; ++p) {
+    PetscCall(PetscSectionGetDof(section, p, &dof));
+    most = std::max(most, dof);
+  }
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &most, 1, MPIU_INT, MPI_MAX, PetscObjectComm((PetscObject)dm)));
+  dimension = most > 0 ? 3 : 2;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// The middle of a vertex, edge or face, to the last bit whatever the order of its vertices. @p reversed: an edge whose
+/// second vertex comes before the first.
+PetscErrorCode find_place(DM dm, PetscInt point, PetscReal x[3], bool &reversed)
+{
+  std::vector<ElementNode> nodes;
+  std::vector<std::array<PetscReal, 3>> corners;
+
+  PetscFunctionBeginUser;
+  PetscCall(nodes_at(dm, point, 1, nodes));
+  for (PetscInt i = 0; i < nodes[0].n; ++i) {
+    corners.emplace_back();
+    PetscCall(node_coordinates(dm, nodes[0].vertices[i], corners.back().data()));
+  }
+  reversed = nodes[0].n == 2 && corners[1] < corners[0];
+  std::vector<PetscReal> one(corners.size());
+  for (std::size_t d = 0; d < 3; ++d) {
+    for (std::size_t i = 0; i < corners.size(); ++i) one[i] = corners[i][d];
+    std::sort(one.begin(), one.end());
+    x[d] = std::accumulate(one.begin(), one.end(), PetscReal(0)) / static_cast<PetscReal>(one.size());
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 /// On rank 0: where the entries of each rank begin.
 std::vector<PetscMPIInt> starts(const std::vector<PetscMPIInt> &counts)
 {
@@ -92,7 +133,7 @@ std::vector<PetscMPIInt> starts(const std::vector<PetscMPIInt> &counts)
 
 } // namespace
 
-PetscErrorCode owned_nodes(DM dm, std::vector<PetscInt> &nodes)
+PetscErrorCode owned_points(DM dm, PetscInt dimension, std::vector<PetscInt> &points)
 {
   PetscInt end, roots, n_leaves;
   const PetscInt *leaves;
@@ -104,12 +145,12 @@ PetscErrorCode owned_nodes(DM dm, std::vector<PetscInt> &nodes)
   PetscCall(PetscSFGetGraph(sf, &roots, &n_leaves, &leaves, nullptr));
   std::vector<char> foreign(static_cast<std::size_t>(end), 0);
   for (PetscInt i = 0; roots >= 0 && i < n_leaves; ++i) foreign[leaves ? leaves[i] : i] = 1;
-  nodes.clear();
-  for (PetscInt depth = 0; depth < 2; ++depth) {
+  points.clear();
+  for (PetscInt depth = 0; depth < dimension; ++depth) {
     PetscInt a, b;
     PetscCall(DMPlexGetDepthStratum(dm, depth, &a, &b));
     for (PetscInt p = a; p < b; ++p)
-      if (!foreign[p]) nodes.push_back(p);
+      if (!foreign[p]) points.push_back(p);
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -117,8 +158,8 @@ PetscErrorCode owned_nodes(DM dm, std::vector<PetscInt> &nodes)
 PetscErrorCode NodeOrder::setup(DM dm)
 {
   const MPI_Comm comm = PetscObjectComm((PetscObject)dm);
-  PetscInt vertex_begin, vertex_end;
   PetscMPIInt rank, size, n;
+  PetscInt dimension = 0;
   std::vector<std::uint64_t> around;
   std::vector<Key> mine, all;
   MPI_Datatype key_type;
@@ -128,13 +169,17 @@ PetscErrorCode NodeOrder::setup(DM dm)
   dm_ = dm;
   PetscCallMPI(MPI_Comm_rank(comm, &rank));
   PetscCallMPI(MPI_Comm_size(comm, &size));
-  PetscCall(owned_nodes(dm, nodes_));
+  PetscCall(highest_dimension(dm, dimension));
+  PetscCall(owned_points(dm, dimension, points_));
   PetscCall(hash_cells(dm, around));
-  PetscCall(DMPlexGetDepthStratum(dm, 0, &vertex_begin, &vertex_end));
-  for (const PetscInt p : nodes_) {
-    Key key{p < vertex_begin || p >= vertex_end, {0, 0, 0}, around[p]};
-    PetscCall(node_coordinates(dm, p, key.x));
+  for (const PetscInt p : points_) {
+    PetscInt depth;
+    bool reversed = false;
+    PetscCall(DMPlexGetPointDepth(dm, p, &depth));
+    Key key{depth, {0, 0, 0}, around[p]};
+    PetscCall(find_place(dm, p, key.x, reversed));
     mine.push_back(key);
+    reversed_.push_back(reversed);
   }
   std::vector<PetscMPIInt> counts(rank == 0 ? size : 0);
   PetscCall(PetscMPIIntCast(static_cast<PetscInt>(mine.size()), &n));
@@ -151,16 +196,16 @@ PetscErrorCode NodeOrder::setup(DM dm)
     std::sort(order.begin(), order.end(), [&](std::size_t a, std::size_t b) { return all[a].tie() < all[b].tie(); });
     place_.resize(all.size());
     std::uint64_t whole = 0;
-    n_vertices_ = 0;
+    counts_ = {0, 0, 0};
     for (std::size_t i = 0; i < order.size(); ++i) {
       const Key &key = all[order[i]];
       place_[order[i]] = i;
-      n_vertices_ += key.depth == 0;
-      whole = scramble(whole ^ hash(key.x) ^ key.cells);
+      ++counts_[static_cast<std::size_t>(key.depth)];
+      if (key.depth < 2) whole = scramble(whole ^ hash(key.x) ^ key.cells); // the mesh, whatever its elements
       if (i > 0 && key.tie() == all[order[i - 1]].tie()) distinct = false;
     }
     char text[128];
-    std::snprintf(text, sizeof(text), "%zu vertices, %zu edges, hash %016llx", n_vertices_, all.size() - n_vertices_,
+    std::snprintf(text, sizeof(text), "%zu vertices, %zu edges, hash %016llx", counts_[0], counts_[1],
                   static_cast<unsigned long long>(whole));
     identity_ = text;
   }
@@ -171,24 +216,27 @@ PetscErrorCode NodeOrder::setup(DM dm)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode NodeOrder::count(PetscInt field, PetscInt &components, std::vector<PetscMPIInt> &counts,
+PetscErrorCode NodeOrder::count(PetscInt field, Widths &widths, std::vector<PetscMPIInt> &counts,
                                 std::vector<PetscMPIInt> &offsets) const
 {
   const MPI_Comm comm = PetscObjectComm((PetscObject)dm_);
   PetscSection section;
-  PetscInt n = 0;
+  PetscInt n = 0, of_kind[kinds] = {0, 0, 0};
   PetscMPIInt rank, size, values;
 
   PetscFunctionBeginUser;
   PetscCallMPI(MPI_Comm_rank(comm, &rank));
   PetscCallMPI(MPI_Comm_size(comm, &size));
   PetscCall(DMGetLocalSection(dm_, &section));
-  PetscCall(PetscSectionGetFieldComponents(section, field, &components));
-  for (const PetscInt p : nodes_) {
-    PetscInt dof;
+  for (const PetscInt p : points_) {
+    PetscInt dof, depth;
     PetscCall(PetscSectionGetFieldDof(section, p, field, &dof));
+    PetscCall(DMPlexGetPointDepth(dm_, p, &depth));
+    of_kind[depth] = dof;
     n += dof;
   }
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, of_kind, kinds, MPIU_INT, MPI_MAX, comm));
+  std::copy_n(of_kind, kinds, widths.begin());
   PetscCall(PetscMPIIntCast(n, &values));
   counts.assign(rank == 0 ? size : 0, 0);
   PetscCallMPI(MPI_Gather(&values, 1, MPI_INT, counts.data(), 1, MPI_INT, 0, comm));
@@ -196,44 +244,64 @@ PetscErrorCode NodeOrder::count(PetscInt field, PetscInt &components, std::vecto
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-template <class Copy>
-void NodeOrder::each_node(PetscInt components, std::size_t n_values, Copy copy) const
+PetscErrorCode NodeOrder::owned_dofs(PetscInt field, std::vector<PetscInt> &dofs) const
 {
-  const auto width = static_cast<std::size_t>(components);
-  const bool vertices_only = n_values == n_vertices_ * width;
+  PetscSection section;
+  PetscInt components;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMGetLocalSection(dm_, &section));
+  PetscCall(PetscSectionGetFieldComponents(section, field, &components));
+  for (std::size_t i = 0; i < points_.size(); ++i) {
+    PetscInt dof, offset;
+    PetscCall(PetscSectionGetFieldDof(section, points_[i], field, &dof));
+    PetscCall(PetscSectionGetFieldOffset(section, points_[i], field, &offset));
+    for (PetscInt d = 0; d < dof; ++d) {
+      const PetscInt node = d / components, last = dof / components - 1;
+      dofs.push_back(offset + (reversed_[i] ? last - node : node) * components + d % components);
+    }
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+template <class Copy>
+void NodeOrder::each_point(const Widths &widths, Copy copy) const
+{
+  std::array<std::size_t, kinds> first_place{}, first_value{}; // of each kind
   std::size_t gathered = 0;
+  for (std::size_t k = 1; k < kinds; ++k) {
+    first_place[k] = first_place[k - 1] + counts_[k - 1];
+    first_value[k] = first_value[k - 1] + widths[k - 1] * counts_[k - 1];
+  }
   for (const std::size_t place : place_) {
-    if (vertices_only && place >= n_vertices_) continue;
-    copy(width * gathered++, width * place);
+    std::size_t kind = kinds - 1;
+    while (place < first_place[kind]) --kind;
+    copy(gathered, first_value[kind] + (place - first_place[kind]) * widths[kind], widths[kind]);
+    gathered += widths[kind];
   }
 }
 
 PetscErrorCode NodeOrder::gather(PetscInt field, Vec local, std::vector<double> &values) const
 {
   const MPI_Comm comm = PetscObjectComm((PetscObject)dm_);
-  PetscSection section;
-  PetscInt components;
+  Widths widths;
   std::vector<PetscMPIInt> counts, offsets;
+  std::vector<PetscInt> dofs;
   std::vector<double> mine, all;
 
   PetscFunctionBeginUser;
-  PetscCall(count(field, components, counts, offsets));
-  PetscCall(DMGetLocalSection(dm_, &section));
+  PetscCall(count(field, widths, counts, offsets));
+  PetscCall(owned_dofs(field, dofs));
   {
     const ReadArray x(local);
-    for (const PetscInt p : nodes_) {
-      PetscInt dof, offset;
-      PetscCall(PetscSectionGetFieldDof(section, p, field, &dof));
-      PetscCall(PetscSectionGetFieldOffset(section, p, field, &offset));
-      mine.insert(mine.end(), x.data() + offset, x.data() + offset + dof);
-    }
+    for (const PetscInt dof : dofs) mine.push_back(x[dof]);
   }
   if (!counts.empty()) all.resize(static_cast<std::size_t>(offsets.back()) + static_cast<std::size_t>(counts.back()));
   PetscCallMPI(MPI_Gatherv(mine.data(), static_cast<PetscMPIInt>(mine.size()), MPI_DOUBLE, all.data(), counts.data(),
                            offsets.data(), MPI_DOUBLE, 0, comm));
   values.resize(all.size());
-  each_node(components, all.size(), [&](std::size_t gathered, std::size_t ordered) {
-    std::copy_n(&all[gathered], components, &values[ordered]);
+  each_point(widths, [&](std::size_t gathered, std::size_t ordered, std::size_t n) {
+    std::copy_n(&all[gathered], n, &values[ordered]);
   });
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -243,50 +311,53 @@ PetscErrorCode NodeOrder::scatter(PetscInt field, const std::vector<double> &val
   const MPI_Comm comm = PetscObjectComm((PetscObject)dm_);
   PetscSection section;
   PetscSF sf;
-  PetscInt components, end, roots;
+  PetscInt end, roots;
+  Widths widths;
   std::vector<PetscMPIInt> counts, offsets;
-  std::vector<double> mine, all(values.size());
+  std::vector<PetscInt> dofs;
+  std::vector<double> all(values.size());
   PetscMPIInt rank;
 
   PetscFunctionBeginUser;
   PetscCallMPI(MPI_Comm_rank(comm, &rank));
-  PetscCall(count(field, components, counts, offsets));
+  PetscCall(count(field, widths, counts, offsets));
   fits =
       rank != 0 || values.size() == static_cast<std::size_t>(offsets.back()) + static_cast<std::size_t>(counts.back());
   PetscCall(from_root(comm, fits));
   if (!fits) PetscFunctionReturn(PETSC_SUCCESS);
-  each_node(components, all.size(), [&](std::size_t gathered, std::size_t ordered) {
-    std::copy_n(&values[ordered], components, &all[gathered]);
+  each_point(widths, [&](std::size_t gathered, std::size_t ordered, std::size_t n) {
+    std::copy_n(&values[ordered], n, &all[gathered]);
   });
-  PetscCall(DMPlexGetChart(dm_, nullptr, &end));
-  PetscCall(DMGetLocalSection(dm_, &section));
+  PetscCall(owned_dofs(field, dofs));
+  std::vector<double> mine(dofs.size());
+  PetscCallMPI(MPI_Scatterv(all.data(), counts.data(), offsets.data(), MPI_DOUBLE, mine.data(),
+                            static_cast<PetscMPIInt>(mine.size()), MPI_DOUBLE, 0, comm));
+  WriteArray x(local);
+  for (std::size_t i = 0; i < dofs.size(); ++i) x[dofs[i]] = mine[i];
+
+  // what other ranks own
   PetscCall(DMGetPointSF(dm_, &sf));
   PetscCall(PetscSFGetGraph(sf, &roots, nullptr, nullptr, nullptr));
-  std::vector<PetscInt> place(static_cast<std::size_t>(end), -1); // [mesh point]: first entry in the local vector
-  std::size_t n = 0;
-  for (PetscInt p = 0; p < end; ++p) {
-    PetscInt dof, offset;
-    PetscCall(PetscSectionGetFieldDof(section, p, field, &dof));
-    PetscCall(PetscSectionGetFieldOffset(section, p, field, &offset));
-    if (dof > 0) place[p] = offset;
-  }
-  for (const PetscInt p : nodes_) n += place[p] >= 0 ? static_cast<std::size_t>(components) : 0;
-  mine.resize(n);
-  PetscCallMPI(MPI_Scatterv(all.data(), counts.data(), offsets.data(), MPI_DOUBLE, mine.data(),
-                            static_cast<PetscMPIInt>(n), MPI_DOUBLE, 0, comm));
-  WriteArray x(local);
-  for (PetscInt c = 0; c < components; ++c) { // owned values, then those of other ranks' nodes
-    std::vector<double> owned(static_cast<std::size_t>(end), 0);
-    n = 0;
-    for (const PetscInt p : nodes_)
-      if (place[p] >= 0) owned[p] = mine[static_cast<std::size_t>(components) * n++ + static_cast<std::size_t>(c)];
-    std::vector<double> known = owned;
-    if (roots >= 0) {
-      PetscCall(PetscSFBcastBegin(sf, MPI_DOUBLE, owned.data(), known.data(), MPI_REPLACE));
-      PetscCall(PetscSFBcastEnd(sf, MPI_DOUBLE, owned.data(), known.data(), MPI_REPLACE));
-    }
-    for (PetscInt p = 0; p < end; ++p)
-      if (place[p] >= 0) x[place[p] + c] = known[p];
+  if (roots < 0) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(DMPlexGetChart(dm_, nullptr, &end));
+  PetscCall(DMGetLocalSection(dm_, &section));
+  std::vector<double> owned(static_cast<std::size_t>(end)), known(static_cast<std::size_t>(end));
+  for (PetscInt d = 0; d < static_cast<PetscInt>(*std::max_element(widths.begin(), widths.end())); ++d) {
+    const auto each = [&](auto &&visit) -> PetscErrorCode {
+      PetscFunctionBeginUser;
+      for (PetscInt p = 0; p < end; ++p) {
+        PetscInt dof, offset;
+        PetscCall(PetscSectionGetFieldDof(section, p, field, &dof));
+        PetscCall(PetscSectionGetFieldOffset(section, p, field, &offset));
+        if (d < dof) visit(p, offset + d);
+      }
+      PetscFunctionReturn(PETSC_SUCCESS);
+    };
+    PetscCall(each([&](PetscInt p, PetscInt dof) { owned[p] = x[dof]; }));
+    known = owned;
+    PetscCall(PetscSFBcastBegin(sf, MPI_DOUBLE, owned.data(), known.data(), MPI_REPLACE));
+    PetscCall(PetscSFBcastEnd(sf, MPI_DOUBLE, owned.data(), known.data(), MPI_REPLACE));
+    PetscCall(each([&](PetscInt p, PetscInt dof) { x[dof] = known[p]; }));
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }

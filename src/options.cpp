@@ -323,6 +323,12 @@ OptionList Options::own_used() const
   return list;
 }
 
+bool Options::at_default(const std::string &name) const
+{
+  return std::any_of(declared_.begin(), declared_.end(),
+                     [&](const Declared &d) { return d.name == name && same_value(d.used, d.value); });
+}
+
 bool Options::same_value(const std::string &a, const std::string &b)
 {
   if (a == b || (truth(a) && truth(a) == truth(b))) return true;

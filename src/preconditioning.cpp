@@ -1,13 +1,16 @@
 #include "pulmo/preconditioning.hpp"
 
-#include "pulmo/mesh.hpp"
+#include "pulmo/assembly.hpp"
+#include "pulmo/elements.hpp"
 #include "pulmo/pattern.hpp"
 #include "pulmo/point.hpp"
+#include "pulmo/simd.hpp"
 #include "pulmo/single_blocks.hpp"
 
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <numeric>
 #include <petsc/private/pcimpl.h>
 
 namespace pulmo {
@@ -15,14 +18,15 @@ namespace pulmo {
 namespace {
 
 /// Global number of each free dof of field @p f at a point, -1 for a constrained one. Also for ghosts.
-PetscErrorCode free_dofs(PetscSection section, PetscSection global, PetscInt point, PetscInt f, PetscInt dofs[3],
-                         PetscInt &n, bool &owned)
+PetscErrorCode free_dofs(PetscSection section, PetscSection global, PetscInt point, PetscInt f,
+                         std::vector<PetscInt> &dofs, bool &owned)
 {
-  PetscInt offset, field_offset, first, constrained;
+  PetscInt n, offset, field_offset, first, constrained;
   const PetscInt *which = nullptr;
 
   PetscFunctionBeginUser;
   PetscCall(PetscSectionGetFieldDof(section, point, f, &n));
+  dofs.resize(static_cast<std::size_t>(n));
   if (n == 0) PetscFunctionReturn(PETSC_SUCCESS);
   PetscCall(PetscSectionGetOffset(section, point, &offset));
   PetscCall(PetscSectionGetFieldOffset(section, point, f, &field_offset));
@@ -51,19 +55,20 @@ PetscErrorCode rigid_body_modes(DM dm, PetscSection section, PetscSection global
   PetscCall(PetscSectionGetConstrainedStorageSize(global, &size));
   for (Vec &mode : v) PetscCall(VecCreateMPI(comm, size, PETSC_DETERMINE, &mode));
   PetscCall(PetscSectionGetChart(section, &begin, &end));
+  std::vector<PetscInt> dofs;
+  std::vector<std::array<PetscReal, 3>> nodes;
   for (PetscInt p = begin; p < end; ++p) {
-    PetscInt dofs[3], n;
-    PetscReal x[3];
     bool owned = false;
-    PetscCall(free_dofs(section, global, p, f, dofs, n, owned));
-    if (n != 3 || !owned) continue;
-    PetscCall(node_coordinates(dm, p, x));
-    for (PetscInt d = 0; d < 3; ++d) {
-      const PetscInt next = (d + 1) % 3, last = (d + 2) % 3; // rotation about axis k moves along k+1 by -x[k+2], ...
-      if (dofs[d] < 0) continue;
-      PetscCall(VecSetValue(v[d], dofs[d], 1, INSERT_VALUES));
-      PetscCall(VecSetValue(v[3 + last], dofs[d], -x[next], INSERT_VALUES));
-      PetscCall(VecSetValue(v[3 + next], dofs[d], x[last], INSERT_VALUES));
+    PetscCall(free_dofs(section, global, p, f, dofs, owned));
+    if (!owned) continue;
+    PetscCall(node_coordinates(dm, p, static_cast<PetscInt>(dofs.size()) / 3, nodes));
+    for (std::size_t i = 0; i < dofs.size(); ++i) {
+      const std::size_t d = i % 3, next = (d + 1) % 3, last = (d + 2) % 3;
+      const auto &x = nodes[i / 3];
+      if (dofs[i] < 0) continue;
+      PetscCall(VecSetValue(v[d], dofs[i], 1, INSERT_VALUES)); // rotation about axis k moves along k+1 by -x[k+2], ...
+      PetscCall(VecSetValue(v[3 + last], dofs[i], -x[next], INSERT_VALUES));
+      PetscCall(VecSetValue(v[3 + next], dofs[i], x[last], INSERT_VALUES));
     }
   }
   for (Vec mode : v) {
@@ -100,11 +105,11 @@ PetscErrorCode make_modes(DM dm, PetscInt, PetscInt field, MatNullSpace *modes)
 struct PMultigrid {
   PC mg = nullptr;
   Mat interpolation = nullptr, coarse = nullptr;
-  Mat single = nullptr; ///< P2 in single precision, if so asked for
+  Mat single = nullptr; ///< the matrix in single precision, if so asked for
   PetscBool use_single = PETSC_FALSE;
 };
 
-/// The interpolation from P1 to the P2 displacement of @p dm, and the rigid-body modes of P1.
+/// The interpolation from P1 to the displacement of @p dm, and the rigid-body modes of P1.
 PetscErrorCode make_interpolation(DM dm, PetscInt block_size, Mat *P, MatNullSpace *modes)
 {
   const MPI_Comm comm = PetscObjectComm((PetscObject)dm);
@@ -149,27 +154,22 @@ PetscErrorCode make_interpolation(DM dm, PetscInt block_size, Mat *P, MatNullSpa
   PetscCall(MatSetSizes(*P, rows, columns, PETSC_DETERMINE, PETSC_DETERMINE));
   if (block_size == 3) PetscCall(MatSetBlockSizes(*P, 3, 3)); // no node is held in part
   PetscCall(MatSetType(*P, MATAIJ));
-  PetscCall(MatSeqAIJSetPreallocation(*P, 2, nullptr));
-  PetscCall(MatMPIAIJSetPreallocation(*P, 2, nullptr, 2, nullptr));
+  PetscCall(MatSeqAIJSetPreallocation(*P, 3, nullptr));
+  PetscCall(MatMPIAIJSetPreallocation(*P, 3, nullptr, 3, nullptr));
+  std::vector<PetscInt> row, column;
+  std::vector<ElementNode> nodes;
   for (PetscInt p = begin; p < end; ++p) {
-    PetscInt row[3], n;
-    bool owned = false;
-    PetscCall(free_dofs(fine, fine_global, p, displacement, row, n, owned));
-    if (n != 3 || !owned) continue;
-    const PetscInt *ends = &p;
-    PetscInt n_ends = 1;
-    if (p < vertex_begin || p >= vertex_end) {
-      PetscCall(DMPlexGetCone(dm, p, &ends));
-      PetscCall(DMPlexGetConeSize(dm, p, &n_ends));
-      PetscCheck(n_ends == 2, comm, PETSC_ERR_SUP, "p_multigrid is for P2 displacement on tetrahedra");
-    }
-    for (PetscInt e = 0; e < n_ends; ++e) {
-      PetscInt column[3];
-      bool unused;
-      PetscCall(free_dofs(coarse, coarse_global, ends[e], 0, column, n, unused));
-      for (PetscInt d = 0; d < 3; ++d)
-        if (row[d] >= 0 && column[d] >= 0) PetscCall(MatSetValue(*P, row[d], column[d], 1. / n_ends, INSERT_VALUES));
-    }
+    bool owned = false, unused;
+    PetscCall(free_dofs(fine, fine_global, p, displacement, row, owned));
+    if (!owned) continue;
+    PetscCall(nodes_at(dm, p, static_cast<PetscInt>(row.size()) / 3, nodes));
+    for (std::size_t k = 0; k < nodes.size(); ++k)
+      for (PetscInt i = 0; i < nodes[k].n; ++i) {
+        PetscCall(free_dofs(coarse, coarse_global, nodes[k].vertices[i], 0, column, unused));
+        for (std::size_t d = 0; d < 3; ++d)
+          if (row[3 * k + d] >= 0 && column[d] >= 0)
+            PetscCall(MatSetValue(*P, row[3 * k + d], column[d], nodes[k].weights[i], INSERT_VALUES));
+      }
   }
   PetscCall(MatAssemblyBegin(*P, MAT_FINAL_ASSEMBLY));
   PetscCall(MatAssemblyEnd(*P, MAT_FINAL_ASSEMBLY));
@@ -277,7 +277,7 @@ PetscErrorCode p_multigrid_options(PC pc, PetscOptionItems *PetscOptionsObject)
 
   PetscFunctionBeginUser;
   PetscOptionsHeadBegin(PetscOptionsObject, "p-multigrid");
-  PetscCall(PetscOptionsBool("-pmg_single", "keep the P2 matrix in single precision for the smoother", "",
+  PetscCall(PetscOptionsBool("-pmg_single", "keep the displacement's matrix in single precision for the smoother", "",
                              self->use_single, &self->use_single, nullptr));
   PetscOptionsHeadEnd();
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -287,7 +287,8 @@ PetscErrorCode view_p_multigrid(PC pc, PetscViewer viewer)
 {
   PetscFunctionBeginUser;
   const bool single = static_cast<PMultigrid *>(pc->data)->single;
-  PetscCall(PetscViewerASCIIPrintf(viewer, "  P2 displacement above P1%s\n", single ? ", P2 in single precision" : ""));
+  PetscCall(PetscViewerASCIIPrintf(viewer, "  displacement above its P1 interpolant%s\n",
+                                   single ? ", in single precision" : ""));
   if (auto *mg = static_cast<PMultigrid *>(pc->data)->mg) PetscCall(PCView(mg, viewer));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -338,56 +339,81 @@ PetscErrorCode attach_rigid_body_modes(DM dm)
 
 // ------------------------------------------------------------------------------------------------ fixed stress
 
-PetscErrorCode FixedStress::setup(DM dm)
+PetscErrorCode FixedStress::setup(DM dm, const Assembly &assembly)
 {
   const PetscInt field = pressure;
   PetscSection section, global;
   DMHandle sub;
   ISHandle is;
-  PetscInt begin, end, cell_begin, cell_end;
+  PetscDS ds;
+  PetscInt begin, end, size, *element_sizes;
 
   PetscFunctionBeginUser;
-  dm_ = dm;
+  PetscCall(DMGetDS(dm, &ds));
+  PetscCall(PetscDSGetDimensions(ds, &element_sizes));
+  n_u_ = element_sizes[displacement];
+  n_p_ = element_sizes[pressure];
+  PetscCheck(n_p_ <= max_nodes, PETSC_COMM_SELF, PETSC_ERR_SUP, "elements with more than %d nodes", max_nodes);
+  PetscCall(make_mass_matrix(ds));
   PetscCall(DMCreateSubDM(dm, 1, &field, is.out(), sub.out()));
   PetscCall(create_matrix(sub, matrix_.out()));
-  PetscCall(DMGetLocalSection(sub, &section));
+  PetscCall(DMGetLocalSection(dm, &section));
   PetscCall(DMGetGlobalSection(sub, &global));
   PetscCall(PetscSectionGetChart(section, &begin, &end));
+  PetscCall(PetscSectionGetStorageSize(section, &size));
+  PetscSection alone; // of the pressure
+  PetscCall(DMGetLocalSection(sub, &alone));
   point_row_.assign(end, -1);
-  std::vector<PetscInt> row(end, -1);
+  std::vector<PetscInt> row(size, -1), dofs; // [local dof]
+  std::vector<PetscReal> x(size, 0);         // [local dof]: the node's coordinate in its direction
+  std::vector<std::array<PetscReal, 3>> nodes;
   for (PetscInt p = begin; p < end; ++p) {
-    PetscInt dofs[3] = {-1, -1, -1}, n;
+    PetscInt n, offset;
     bool owned = false;
-    PetscCall(free_dofs(section, global, p, 0, dofs, n, owned));
-    if (n == 0) continue;
-    row[p] = dofs[0];
+    PetscCall(PetscSectionGetFieldDof(section, p, displacement, &n));
+    PetscCall(PetscSectionGetFieldOffset(section, p, displacement, &offset));
+    PetscCall(node_coordinates(dm, p, n / 3, nodes));
+    for (PetscInt i = 0; i < n; ++i) x[offset + i] = nodes[i / 3][i % 3];
+    PetscCall(free_dofs(alone, global, p, 0, dofs, owned));
+    if (dofs.empty()) continue;
+    PetscCheck(dofs.size() == 1, PETSC_COMM_SELF, PETSC_ERR_SUP, "several nodes of the pressure at a mesh point");
+    PetscCall(PetscSectionGetFieldOffset(section, p, pressure, &offset));
+    row[offset] = dofs[0];
     if (owned) point_row_[p] = dofs[0];
   }
-  PetscCall(DMGetLocalSection(dm, &section));
-  std::vector<PetscReal> x(static_cast<std::size_t>(3 * end), PETSC_MAX_REAL); // of the nodes of the displacement
-  for (PetscInt p = begin; p < end; ++p) {
-    PetscInt dof;
-    PetscCall(PetscSectionGetFieldDof(section, p, displacement, &dof));
-    if (dof == 3) PetscCall(node_coordinates(dm, p, &x[3 * p]));
-  }
-  PetscCall(DMPlexGetHeightStratum(dm, 0, &cell_begin, &cell_end));
-  rows_.reserve(vertices_ * (cell_end - cell_begin));
-  for (PetscInt c = cell_begin; c < cell_end; ++c) {
-    PetscInt *closure = nullptr, n_closure;
+  position_.reserve(n_u_ * assembly.cells());
+  rows_.reserve(n_p_ * assembly.cells());
+  for (PetscInt c = 0; c < assembly.cells(); ++c) {
+    const PetscInt *of_cell = assembly.cell_dofs(c);
     PetscReal middle[3] = {0, 0, 0};
-    const std::size_t first = position_.size();
-    PetscCall(DMPlexGetTransitiveClosure(dm, c, PETSC_TRUE, &n_closure, &closure));
-    for (PetscInt i = 0; i < n_closure; ++i) {
-      const PetscReal *node = &x[3 * closure[2 * i]];
-      if (node[0] != PETSC_MAX_REAL) position_.insert(position_.end(), node, node + 3);
-    }
-    for (PetscInt i = n_closure - vertices_; i < n_closure; ++i) rows_.push_back(row[closure[2 * i]]); // come last
-    PetscCall(DMPlexRestoreTransitiveClosure(dm, c, PETSC_TRUE, &n_closure, &closure));
-    nodes_ = static_cast<PetscInt>(position_.size() - first) / 3;
-    if (c == cell_begin) position_.reserve(3 * nodes_ * (cell_end - cell_begin));
-    for (std::size_t i = first; i < position_.size(); ++i) middle[(i - first) % 3] += position_[i] / (PetscReal)nodes_;
-    for (std::size_t i = first; i < position_.size(); ++i) position_[i] -= middle[(i - first) % 3];
+    for (PetscInt i = 0; i < n_u_; ++i) middle[i % 3] += 3 * x[of_cell[i]] / static_cast<PetscReal>(n_u_);
+    for (PetscInt i = 0; i < n_u_; ++i) position_.push_back(x[of_cell[i]] - middle[i % 3]);
+    for (PetscInt a = 0; a < n_p_; ++a) rows_.push_back(row[of_cell[n_u_ + a]]);
   }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Of the pressure's basis functions on a cell of volume 1.
+PetscErrorCode FixedStress::make_mass_matrix(PetscDS ds)
+{
+  PetscFE fe;
+  PetscInt n;
+  const PetscReal *xi, *weights;
+  QuadratureHandle rule;
+  PetscTabulation T;
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscDTSimplexQuadrature(3, 4, PETSCDTSIMPLEXQUAD_MINSYM, rule.out())); // exact up to P2 times P2
+  PetscCall(PetscQuadratureGetData(rule, nullptr, nullptr, &n, &xi, &weights));
+  const PetscReal total = std::accumulate(weights, weights + n, PetscReal(0));
+  PetscCall(PetscDSGetDiscretization(ds, pressure, (PetscObject *)&fe));
+  PetscCall(PetscFECreateTabulation(fe, 1, n, xi, 0, &T));
+  mass_.assign(n_p_ * n_p_, 0);
+  for (PetscInt q = 0; q < n; ++q)
+    for (PetscInt a = 0; a < n_p_; ++a)
+      for (PetscInt b = 0; b < n_p_; ++b)
+        mass_[n_p_ * a + b] += weights[q] / total * T->T[0][q * n_p_ + a] * T->T[0][q * n_p_ + b];
+  PetscCall(PetscTabulationDestroy(&T));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -400,9 +426,9 @@ PetscErrorCode FixedStress::begin()
 
 PetscErrorCode FixedStress::add(PetscInt c, const PetscScalar *matrix, const PetscReal row_scale[])
 {
-  const PetscInt nu = 3 * nodes_, size = nu + vertices_;
+  const PetscInt nu = n_u_, size = nu + n_p_;
   const PetscReal *w = &position_[c * nu];
-  PetscScalar stiffness = 0, storage = 0, load = 0, S[16];
+  PetscScalar stiffness = 0, storage = 0, load = 0, S[max_nodes * max_nodes];
 
   PetscFunctionBeginHot;
   for (PetscInt i = 0; i < size; ++i) {
@@ -418,11 +444,11 @@ PetscErrorCode FixedStress::add(PetscInt c, const PetscScalar *matrix, const Pet
   }
   // S - A_pp is positive where the tissue stands a dilation; elsewhere (softening) nothing is added
   const PetscScalar c_e = stiffness > 0 ? -storage * load / stiffness : 0;
-  for (PetscInt a = 0; a < vertices_; ++a)
-    for (PetscInt b = 0; b < vertices_; ++b)
-      S[vertices_ * a + b] =
-          row_scale[pressure] * matrix[(nu + a) * size + nu + b] + (c_e > 0 ? c_e * (a == b ? 2 : 1) / 20 : 0);
-  PetscCall(MatSetValues(matrix_, vertices_, &rows_[vertices_ * c], vertices_, &rows_[vertices_ * c], S, ADD_VALUES));
+  for (PetscInt a = 0; a < n_p_; ++a)
+    for (PetscInt b = 0; b < n_p_; ++b)
+      S[n_p_ * a + b] =
+          row_scale[pressure] * matrix[(nu + a) * size + nu + b] + (c_e > 0 ? c_e * mass_[n_p_ * a + b] : 0);
+  PetscCall(MatSetValues(matrix_, n_p_, &rows_[n_p_ * c], n_p_, &rows_[n_p_ * c], S, ADD_VALUES));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

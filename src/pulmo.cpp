@@ -3,6 +3,7 @@
 #include "pulmo/checkpoint.hpp"
 
 #include <algorithm>
+#include <cstring>
 
 namespace pulmo {
 
@@ -110,6 +111,26 @@ PetscErrorCode warn_of_no_air(MPI_Comm comm, const Scene &scene, const Simulatio
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+/// Elements of equal order are not stable where the tissue is undrained: in steps @p dt (s) in which pressure spreads
+/// by less than half a cell, k M dt < (h/2)^2. Says so, once.
+PetscErrorCode warn_of_equal_order(MPI_Comm comm, const Scene &scene, const Model &model, PetscReal dt, bool &warned)
+{
+  const Elements &elements = scene.facts().elements;
+  const PetscReal half_edge = scene.mesh().length(); // an edge is about twice the mean cell size
+
+  PetscFunctionBeginUser;
+  if (warned || !scene.facts().airflow || elements.displacement > elements.pressure) PetscFunctionReturn(PETSC_SUCCESS);
+  for (const Effect *effect : scene.active())
+    if (std::strcmp(effect->name(), "pressure_damping") == 0) PetscFunctionReturn(PETSC_SUCCESS);
+  warned = scene.airflow().permeability_at_rest() * model.modulus() * dt < half_edge * half_edge;
+  if (warned)
+    PetscCall(PetscPrintf(comm,
+                          "pulmo: warning: in a step of %g s pressure spreads by less than half a cell, where "
+                          "-elements %s is not stable: look for ripples, or give -pressure_damping\n",
+                          (double)dt, elements.name()));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 } // namespace
 
 PetscErrorCode check_held(MPI_Comm comm, const Scene &scene, const Composition &composition)
@@ -148,7 +169,7 @@ PetscErrorCode Run::declare()
 {
   PetscFunctionBeginUser;
   PetscCall(scene_.declare(options_));
-  PetscCall(model_.declare(options_));
+  PetscCall(model_.declare(options_, scene_.facts().elements));
   PetscCall(simulation_.declare(options_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -162,7 +183,7 @@ PetscErrorCode Run::setup()
   PetscCall(options_.check_unknown());
   PetscCall(options_.check_petsc());
   PetscCall(scene_.prepare(options_));
-  Composition composition(scene_.mesh());
+  Composition composition(scene_.mesh(), scene_.facts().elements);
   PetscCall(scene_.compose(composition));
   PetscCall(model_.build(std::move(composition), reference_modulus(scene_.tissue().law())));
   PetscCall(simulation_.setup());
@@ -205,6 +226,9 @@ PetscErrorCode run(const Registry &registry, bool &finished)
   }
   PetscCall(check_held(comm, scene, run.model().composition()));
   PetscCall(error_estimate.check(options, scene));
+  const Elements &elements = scene.facts().elements;
+  PulmoUserCheck(!output.error_indicator() || (elements.displacement == 2 && elements.pressure == 1), comm,
+                 "-output_fields_error_indicator recovers the stress of -elements P2-P1; leave one of the two out");
 
   SignalWriter signals(comm, output, scene.facts());
   ProgressPrinter progress(comm, scene.facts());
@@ -231,6 +255,8 @@ PetscErrorCode run(const Registry &registry, bool &finished)
   simulation.add(fields);
   if (output.progress()) simulation.add(progress);
   simulation.add(checkpoint);
+  bool warned_of_elements = false;
+  PetscCall(warn_of_equal_order(comm, scene, run.model(), simulation.wanted_dt(), warned_of_elements));
   const bool restarts = !checkpoint.restart().empty();
   if (restarts) PetscCall(checkpoint.restore());
   PetscCall(output.prepare(options, checkpoint.restart(), fields.files()));
@@ -244,6 +270,8 @@ PetscErrorCode run(const Registry &registry, bool &finished)
   }
   PetscCall(options.warn_unused());
   PetscCall(warn_of_no_air(comm, scene, simulation));
+  for (const SignalRow &row : simulation.rows()) // steps that were cut
+    if (row.dt > 0) PetscCall(warn_of_equal_order(comm, scene, run.model(), row.dt, warned_of_elements));
   if (view_effects) PetscCall(print_ledger(comm, scene, run.model(), simulation.seconds()));
   if (audit_energy) PetscCall(write_energy(comm, output, simulation, energy));
   if (!finished) {

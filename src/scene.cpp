@@ -20,6 +20,7 @@ PetscErrorCode Scene::declare(Options &options)
 {
   PetscFunctionBeginUser;
   PetscCall(mesh_.declare(options));
+  PetscCall(facts_.elements.declare(options));
   for (const auto &effect : effects_) PetscCall(effect->declare(options));
   PetscFunctionReturn(PETSC_SUCCESS);
 }

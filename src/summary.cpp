@@ -172,6 +172,7 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
     json["tissue"] = scene.tissue().law().name();
     json["effects"] = Json::array();
     for (const Effect *effect : scene.active()) json["effects"].push_back(effect->name());
+    json["elements"] = scene.facts().elements.name();
     json["integration"] = model.own_integration() ? "pulmo" : "basic";
     json["version"] = PULMO_VERSION;
     Json list;

@@ -4,7 +4,7 @@
 /// An effect that a scene does not ask for only lists its options; it adds no field, no term, no matrix block.
 #pragma once
 
-#include "pulmo/options.hpp"
+#include "pulmo/elements.hpp"
 #include "pulmo/permeability.hpp"
 #include "pulmo/point.hpp"
 #include "pulmo/programme.hpp"
@@ -85,9 +85,10 @@ struct ParameterBlock {
 /// What the effects of a scene put together; filled by Effect::fields and Effect::terms.
 class Composition {
 public:
-  explicit Composition(const Mesh &mesh) : mesh_(mesh) {}
+  Composition(const Mesh &mesh, const Elements &elements) : mesh_(mesh), elements_(elements) {}
 
   const Mesh &mesh() const { return mesh_; }
+  const Elements &elements() const { return elements_; }
   /// Names the effect that speaks next (used by the ledger).
   void speaker(const std::string &effect) { effect_ = effect; }
 
@@ -196,6 +197,7 @@ private:
   }
 
   const Mesh &mesh_;
+  Elements elements_;
   std::string effect_;
   bool common_gas_pressure_ = false;
   std::vector<FieldSpec> fields_;
@@ -222,6 +224,7 @@ enum class FlowSplit {
 
 /// What one effect may know of the scene beside itself.
 struct SceneFacts {
+  Elements elements;
   bool airflow = false;                        ///< the pressure field exists
   std::vector<std::string> airway_surfaces;    ///< open to the ventilator
   std::shared_ptr<const Programme> ventilator; ///< null without a ventilator

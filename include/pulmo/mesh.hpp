@@ -2,14 +2,11 @@
 /// The mesh of a scene: reading, scaling, distribution, checks, named surfaces.
 #pragma once
 
-#include "pulmo/options.hpp"
+#include "pulmo/elements.hpp"
 
 #include <map>
 
 namespace pulmo {
-
-/// Coordinates of a vertex of @p dm or of the middle of an edge.
-PetscErrorCode node_coordinates(DM dm, PetscInt point, PetscReal x[3]);
 
 /// A tetrahedral DMPlex with named surfaces. Coordinates in mm.
 class Mesh {
@@ -58,7 +55,7 @@ public:
   /// Every connected body and every named part of the volume. A body without a name of its own is called body_1, ...,
   /// counted along x.
   PetscErrorCode regions(std::vector<Region> &list) const;
-  /// Coordinates of a vertex or of the middle of an edge, mm.
+  /// Coordinates of a vertex or of the middle of an edge or face, mm.
   PetscErrorCode node_coordinates(PetscInt point, PetscReal x[3]) const
   {
     return pulmo::node_coordinates(dm_, point, x);

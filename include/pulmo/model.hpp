@@ -16,8 +16,8 @@ namespace pulmo {
 /// neither field hides behind the other in the norm.
 class Model {
 public:
-  /// Declares -quadrature_degree.
-  PetscErrorCode declare(Options &options);
+  /// Declares -quadrature_degree; its default and least value are those of @p elements.
+  PetscErrorCode declare(Options &options, const Elements &elements);
   /// @p modulus: tissue stiffness that scales the equations, kPa. The composition's effects must outlive the model.
   PetscErrorCode build(Composition composition, PetscReal modulus);
 
@@ -96,6 +96,7 @@ private:
   PetscErrorCode create_fields();
   PetscErrorCode create_weak_form();
   PetscErrorCode create_section();
+  PetscErrorCode add_symmetries(PetscSection section) const;
   PetscErrorCode find_constraints(std::vector<PetscInt> &constraint_of);
   PetscErrorCode find_airway(const std::vector<PetscInt> &constraint_of);
   PetscErrorCode find_carrier();

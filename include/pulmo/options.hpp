@@ -81,6 +81,8 @@ public:
   PetscErrorCode all_used(OptionList &list) const;
   /// The first half of it: pulmo's own.
   OptionList own_used() const;
+  /// Whether an option of pulmo's own has its default value.
+  bool at_default(const std::string &name) const;
   /// Whether two values of an option say the same: 1e4 and 10000, on and true.
   static bool same_value(const std::string &a, const std::string &b);
 

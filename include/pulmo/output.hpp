@@ -86,7 +86,8 @@ private:
   PetscReal from_ = -1; ///< time at which this session began, s
 };
 
-/// Writes the mesh once and a snapshot of the fields at phase ends or at intervals; P2 stays quadratic.
+/// Writes the mesh once and a snapshot of the fields at phase ends or at intervals; quadratic, so that P3 loses its
+/// cubic part.
 class FieldWriter final : public Observer {
 public:
   FieldWriter(const Output &output, const Scene &scene, Model &model);

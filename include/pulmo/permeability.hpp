@@ -46,6 +46,7 @@ public:
   virtual const char *name() const = 0;
   virtual PetscErrorCode declare(Options &options) = 0;
   virtual const PetscScalar *parameters(PetscInt *count) const = 0;
+  virtual PetscReal at_rest() const = 0; ///< k at J = 1, mm^2/(kPa s)
   virtual PetscPointFunc flux_callback() const = 0;
   virtual PetscPointJac flux_by_displacement_callback() const = 0;
   virtual PetscPointJac flux_by_pressure_callback() const = 0;
@@ -65,6 +66,7 @@ public:
     *count = sizeof(Parameters) / sizeof(PetscScalar);
     return reinterpret_cast<const PetscScalar *>(&parameters_);
   }
+  PetscReal at_rest() const override { return Law::permeability(1, parameters_).k; }
   PetscPointFunc flux_callback() const override { return volume_residual<Parameters, Kernels::flux>; }
   PetscPointJac flux_by_displacement_callback() const override
   {

@@ -9,7 +9,9 @@
 
 namespace pulmo {
 
-/// Registers the PC type `p_multigrid`: two levels, P2 displacement above its P1 interpolant, Galerkin coarse matrix
+class Assembly;
+
+/// Registers the PC type `p_multigrid`: two levels, the displacement above its P1 interpolant, Galerkin coarse matrix
 /// with rigid-body modes. Options under the prefix of the PC: `-pmg_levels_*` (smoother), `-pmg_coarse_*` (the P1
 /// problem). Needs a matrix of the displacement alone.
 PetscErrorCode register_p_multigrid();
@@ -25,7 +27,7 @@ PetscErrorCode attach_rigid_body_modes(DM dm);
 class FixedStress {
 public:
   /// @p dm with fields displacement and pressure.
-  PetscErrorCode setup(DM dm);
+  PetscErrorCode setup(DM dm, const Assembly &assembly);
   bool in_use() const { return matrix_; }
   Mat matrix() const { return matrix_; }
 
@@ -37,11 +39,13 @@ public:
   PetscErrorCode end(const std::vector<PetscInt> &closed);
 
 private:
-  DM dm_ = nullptr; ///< not owned
+  PetscErrorCode make_mass_matrix(PetscDS ds);
+
   MatHandle matrix_;
-  PetscInt nodes_ = 0, vertices_ = 4;
-  std::vector<PetscReal> position_; ///< [cell][node][3] relative to the cell's middle, mm
-  std::vector<PetscInt> rows_;      ///< [cell][vertex]: row of the matrix
+  PetscInt n_u_ = 0, n_p_ = 0;      ///< dofs of a cell
+  std::vector<PetscReal> mass_;     ///< [n_p][n_p]
+  std::vector<PetscReal> position_; ///< [cell][n_u]: nodes relative to the cell's middle, mm
+  std::vector<PetscInt> rows_;      ///< [cell][n_p]: row of the matrix
   std::vector<PetscInt> point_row_; ///< [mesh point]: row of its pressure on this rank, -1 if not owned
 };
 

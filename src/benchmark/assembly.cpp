@@ -57,21 +57,23 @@ PetscErrorCode smooth_state(Run &run, Vec local, Vec rate)
   PetscCall(DMGetLocalSection(dm, &section));
   PetscCall(PetscSectionGetChart(section, &begin, &end));
   PetscCall(DMGetNumFields(dm, &n_fields));
+  std::vector<std::array<PetscReal, 3>> nodes;
   for (PetscInt p = begin; p < end; ++p) {
     PetscInt dof, offset;
-    PetscReal x[3];
-    PetscCall(PetscSectionGetDof(section, p, &dof));
-    if (dof == 0) continue;
-    PetscCall(run.scene().mesh().node_coordinates(p, x));
+    PetscCall(PetscSectionGetFieldDof(section, p, displacement, &dof));
     PetscCall(PetscSectionGetFieldOffset(section, p, displacement, &offset));
-    for (int d = 0; d < 3; ++d) {
-      u[offset + d] = 0.1 * x[d] + 0.03 * x[(d + 1) % 3] + 0.05 / k * std::sin(k * x[(d + 2) % 3]);
-      u_t[offset + d] = 0.3 * u[offset + d];
+    PetscCall(node_coordinates(dm, p, dof / 3, nodes));
+    for (const auto &x : nodes) {
+      for (int d = 0; d < 3; ++d, ++offset) {
+        u[offset] = 0.1 * x[d] + 0.03 * x[(d + 1) % 3] + 0.05 / k * std::sin(k * x[(d + 2) % 3]);
+        u_t[offset] = 0.3 * u[offset];
+      }
     }
     if (n_fields <= pressure) continue;
     PetscCall(PetscSectionGetFieldDof(section, p, pressure, &dof));
     PetscCall(PetscSectionGetFieldOffset(section, p, pressure, &offset));
-    for (PetscInt d = 0; d < dof; ++d) u[offset + d] = 0.4 + 0.1 * std::cos(k * x[0]);
+    PetscCall(node_coordinates(dm, p, dof, nodes));
+    for (const auto &x : nodes) u[offset++] = 0.4 + 0.1 * std::cos(k * x[0]);
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }

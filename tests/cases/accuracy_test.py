@@ -16,7 +16,7 @@ import case_meshes
 import pulmo_case as pulmo
 
 sys.path.insert(0, os.path.join(pulmo.SOURCE, "tools"))
-from accuracy import (command, extrapolate, fields, ladder, manufactured, numbers, page, pictures, search, settings,  # noqa: E402
+from accuracy import (command, elements, extrapolate, fields, ladder, manufactured, numbers, page, pictures, search, settings,  # noqa: E402
                       sphere, truth)
 from accuracy.errors import Axes, estimate  # noqa: E402
 
@@ -119,6 +119,8 @@ class Known:
         h = self.cells[options["-dm_plex_filename"]] ** (-1 / 3)
         dt, order = float(options["-ts_dt"]), 1 if options["-ts_type"] == "beuler" else 2
         a = 2.0 if key == "tidal_volume_ml" else 0.7
+        if options.get("-elements") == "P1-P1":
+            return (1 - 0.9 * a * h ** 2 - h ** 3) * (1 - a * dt ** order / order) - 1
         return (1 + a * h ** 2 + h ** 3) * (1 - a * dt ** order / order) - 1
 
     def measured(self, words, folder, repeat, ranks, timeout):
@@ -127,22 +129,24 @@ class Known:
         options = dict(zip(words, words[1:]))
         steps = 3 / float(options["-ts_dt"])
         cells = self.cells[options["-dm_plex_filename"]]
-        spent = 1e-4 * steps * cells * (1.3 if options["-ts_type"] == "bdf" else 1)
+        linear = options.get("-elements") == "P1-P1"
+        spent = 1e-4 * steps * cells * (0.25 if linear else 1) * (1.3 if options["-ts_type"] == "bdf" else 1)
         values = {key: limit * (1 + self.true_error(words, key)) for key, limit in self.LIMITS.items()} | {"peep_cmH2O": 0.0}
         failed = self.fails(options)
         failed, spent = failed or spent > timeout, min(spent, timeout)
         return {"code": int(failed), "reason": "it was to fail", "cpu": spent, "wall": spent, "memory": cells / 100, "kept": False,
                 "load": [0, 0], "folder": pathlib.Path("nowhere"),
-                "summary": values | {"breaths": [values], "steps": steps, "cells": cells, "dofs": 6 * cells}}
+                "summary": values | {"breaths": [values], "steps": steps, "cells": cells, "dofs": 6 * cells, "rejected_steps": 0}}
 
 
 class Searching(unittest.TestCase):
-    def explored(self, budget, asked=None, fails=None, tetrahedra=(1000, 2500, 6000, 15000), tolerances=(), named=()):
+    def explored(self, budget, asked=None, fails=None, tetrahedra=(1000, 2500, 6000, 15000), tolerances=(), named=(), pairs=("",)):
         cells = {f"{n}.msh": n for n in tetrahedra}
         options = argparse.Namespace(budget=budget, clock="wall", repeat=1, ranks=1, build=pathlib.Path("build"), output=pathlib.Path("nowhere"),
                                      results=pathlib.Path("nowhere"), schemes=["beuler", "bdf"], dt_factors=[4, 2, 1, 0.5, 0.25, 0.125],
                                      adaptive=0, solvers=["iterative"], tolerances=tolerances)
-        meshes = [settings.Mesh(name, ("-dm_plex_filename", name), n) for name, n in cells.items()]
+        meshes = [settings.Mesh(f"{name} {pair}".strip(), ("-dm_plex_filename", name, *(["-elements", pair] if pair else [])), n, "", pair)
+                  for pair in pairs for name, n in cells.items()]
         steps, solvers = settings.steps(options, 0.05), settings.solvers(options)
         base = settings.Setting(meshes[0], next(t for t in steps if t.dt == 0.05), solvers[0])
         known = Known(cells, fails)
@@ -194,6 +198,40 @@ class Searching(unittest.TestCase):
         hopeless, _ = self.explored(10, {"compliance_ml_per_cmH2O": 1e-6})
         self.assertIsNone(hopeless.answers()[0].run)
         self.assertIn("budget", hopeless.sentences()[0])
+
+    def test_element_pairs(self):
+        """Pairs have ladders of their own and one limit; a cheaper pair that is as good is found."""
+        asked = {"compliance_ml_per_cmH2O": 0.005}
+        (one, _), (both, known) = (self.explored(3000, asked, pairs=pairs) for pairs in (("P2-P1",), ("P2-P1", "P1-P1")))
+        answer, = both.answers()
+        self.assertEqual(answer.run.setting.mesh.elements, "P1-P1")
+        self.assertLess(answer.run.cpu, 0.5 * one.answers()[0].run.cpu)
+        self.assertLessEqual(self.true_errors(both, known, answer.run.setting)["compliance_ml_per_cmH2O"], 0.005)
+        key = "compliance_ml_per_cmH2O"
+        e = both.errors()[key]
+        self.assertLessEqual(abs(e.value - Known.LIMITS[key]), e.uncertainty)
+        signs = {m.elements: np.sign(part) for m, part in e.parts.items() if isinstance(m, settings.Mesh)}
+        self.assertEqual(signs, {"P2-P1": 1, "P1-P1": -1}, "errors of either pair against the common limit")
+        whole, _ = self.explored(3000, pairs=("P2-P1", "P1-P1"))
+        values = {s: v * (1.05 if s.mesh.elements == "P1-P1" else 1) for s, v in whole.ladder.values(key).items()}
+        self.assertGreater(estimate(key, values, whole.axes).shares["space"], 0.03 * Known.LIMITS[key], "limits that contradict one another")
+
+    def test_cost_of_element_pairs(self):
+        """A quarter of the cost a cell, 0.9 of the error: errors go with h^2, cost with h^-3."""
+        made, _ = self.explored(3000, pairs=("P2-P1", "P1-P1"))
+        with mock.patch.object(elements, "KEYS", list(Known.LIMITS)), mock.patch.object(elements, "WANTED", (0.006, 0.01)):
+            header, rows = elements.factors({"birzle": made})
+            self.assertEqual([(row[1], row[2]) for row in rows], [(name, share) for name in ("V_T", "C_rs") for share in ("0.6 %", "1 %")])
+            *ratios, last = [row[-1] for row in rows]
+            for ratio in ratios:
+                self.assertAlmostEqual(float(ratio), 4 * (1 / 0.9) ** 1.5, delta=0.6)
+            self.assertEqual(last, "-", "the coarsest meshes meet it already")
+            header, rows = elements.table({"birzle": made})
+        self.assertEqual([(row[0], row[1]) for row in rows], [(pair, n) for pair in ("P2-P1", "P1-P1") for n in (1000, 2500, 6000, 15000)])
+        for row, mesh in zip(rows, made.axes.meshes):
+            h = mesh.size()
+            true = 2 * h ** 2 + h ** 3 if mesh.elements == "P2-P1" else -1.8 * h ** 2 - h ** 3
+            self.assertAlmostEqual(float(row[-1].split()[0]) / 100, true, delta=5e-4)
 
     def test_what_is_not_examined_is_said(self):
         made, _ = self.explored(3000, tetrahedra=[1000])

@@ -19,11 +19,15 @@ SCENES = {
     "no airflow, lumen pressure": ["-airflow", "off", "-lumen_pressure", "-tissue", "yoshihara"],
     "no airflow, pins": PINS + ["-airflow", "off", "-tissue", "ma"],
     "quadrature degree 4": ["-quadrature_degree", "4"],
+    "P1-P1": ["-elements", "P1-P1", "-pressure_damping"],
+    "P3-P2": ["-elements", "P3-P2", "-lumen_pressure", "-ventilator_ramp_down", "0.2"],
 }
 
 VENTILATORS = {
     "vcv, uniform": ["-ventilator_flow_split", "uniform"],
     "vcv, common pressure": ["-ventilator_flow_split", "common_pressure"],
+    "vcv, uniform, P3-P2": ["-ventilator_flow_split", "uniform", "-elements", "P3-P2"],
+    "vcv, common pressure, P3-P2": ["-ventilator_flow_split", "common_pressure", "-elements", "P3-P2"],
     "vcv, no airflow": ["-airflow", "off"],
     "vcv, no airflow, pins": PINS + ["-airflow", "off", "-tissue", "yoshihara"],
     "vcv, tube, lumen pressure": ["-tube", "-tube_k1", "2", "-tube_k2", "1000", "-lumen_pressure"],
@@ -99,7 +103,7 @@ class Parallel(unittest.TestCase):
     def test_the_stock_integrator(self):
         short = pulmo.TIGHT + pulmo.PCV + pulmo.CUBE + ["-ts_max_time", "0.1"]
         for name, ranks in (("airflow", 1), ("lumen pressure", 2), ("pins", 1), ("no airflow", 2),
-                            ("no airflow, pins", 1), ("quadrature degree 4", 1)):
+                            ("no airflow, pins", 1), ("quadrature degree 4", 1), ("P3-P2", 2)):
             with self.subTest(scene=name, ranks=ranks):
                 own = pulmo.finished(short + SCENES[name])
                 explicit = pulmo.finished(short + SCENES[name] + ["-petscfe_type", "pulmo"])
@@ -137,12 +141,14 @@ class Parallel(unittest.TestCase):
             cell_order = np.lexsort(middles.T)
             return x[order], u[order], p[order], middles[cell_order], J[cell_order]
 
-        one = fields(pulmo.finished(short))
-        three = fields(pulmo.finished(short, ranks=3))
-        for name, a, b in zip(("coordinates", "displacement", "pressure", "cells", "J"), one, three):
-            self.assertEqual(a.shape, b.shape)
-            self.assertGreater(np.abs(a).max(), 0)
-            np.testing.assert_allclose(a, b, rtol=0, atol=1e-9 * np.abs(a).max(), err_msg=name)
+        for pair in ("P2-P1", "P1-P1", "P3-P2"):
+            one = fields(pulmo.finished(short + ["-elements", pair]))
+            three = fields(pulmo.finished(short + ["-elements", pair], ranks=3))
+            for name, a, b in zip(("coordinates", "displacement", "pressure", "cells", "J"), one, three):
+                with self.subTest(pair, values=name):
+                    self.assertEqual(a.shape, b.shape)
+                    self.assertGreater(np.abs(a).max(), 0)
+                    np.testing.assert_allclose(a, b, rtol=0, atol=1e-9 * np.abs(a).max())
 
 
 if __name__ == "__main__":

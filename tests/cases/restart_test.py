@@ -186,6 +186,8 @@ class Agreement(RestartCase):
         "BDF2": (CUBE + TWICE + ["-ts_type", "bdf"], 0.45),
         "BDF2, flow": (VCV + ["-ts_type", "bdf"], 0.45),
         "BDF2, limit": (BASE + pulmo.LITRE + TUBE + pulmo.programme(LIMITED) + ["-ts_type", "bdf"], 0.55),
+        "P1-P1": (CUBE + TWICE + ["-elements", "P1-P1", "-pressure_damping"], 0.45),
+        "P3-P2": (VCV + ["-elements", "P3-P2"], 0.45),
         "steps by their error": (CUBE + TWICE + ["-ts_type", "bdf", "-ts_dt", "0.01", "-step_volume_tolerance", "0.5"], 0.45),
         # steps were cut and grow again
         "cut steps": (PCV + ["-snes_max_it", "5", "-ventilator_ramp_down", "0.2"], 0.31),
@@ -212,7 +214,7 @@ class Agreement(RestartCase):
 
     def test_scenes(self):
         for name in self.SCENES:
-            reference = self.run_scene(name, then=(1, 2) if name in ("vcv", "vcv, no airflow") else (1,))
+            reference = self.run_scene(name, then=(1, 2) if name in ("vcv", "vcv, no airflow", "P3-P2") else (1,))
             if name == "cut steps":
                 self.assertGreater(reference.json()["rejected_steps"], 0)
             if name == "limit and tube":
@@ -286,10 +288,12 @@ class Meshes(RestartCase):
             order = random_numbers.permutation(len(cells))
             blocks.append((kind, new[cells][order], tags[order]))
         renumbered = case_meshes.save(points, blocks, self.names) + ["-mesh_scale", "1"]
-        options = CUBE + TWICE + ["-checkpoint_every", "0.45"]
-        reference = pulmo.finished(options)
-        other = pulmo.finished(options + renumbered + ["-restart", reference.path("checkpoint_previous.h5")])
-        self.expect_same(reference, other, OTHER_RANKS, after=0.45)
+        for pair in ("P2-P1", "P3-P2"): # P3: the two nodes of an edge change places with its ends
+            with self.subTest(pair):
+                options = CUBE + TWICE + ["-elements", pair, "-checkpoint_every", "0.45"]
+                reference = pulmo.finished(options)
+                other = pulmo.finished(options + renumbered + ["-restart", reference.path("checkpoint_previous.h5")])
+                self.expect_same(reference, other, OTHER_RANKS, after=0.45)
 
     def test_nodes_at_one_place(self):
         """Two blocks that touch without being joined: there are two nodes at each place of the fissure."""
@@ -300,6 +304,9 @@ class Meshes(RestartCase):
             blocks.append((kind, cells[:, [1, 0] + list(range(2, cells.shape[1]))] + n, tags))
         mesh = case_meshes.save(np.vstack([self.points, mirrored]), blocks, self.names) + ["-mesh_scale", "1"]
         options = CUBE + TWICE + mesh + ["-checkpoint_every", "0.45"]
+        cubic = options + ["-elements", "P3-P2"]
+        once = pulmo.finished(cubic)
+        self.expect_same(once, pulmo.finished(cubic + ["-restart", once.path("checkpoint_previous.h5")], ranks=2), OTHER_RANKS, after=0.45)
         reference = pulmo.finished(options)
         other = pulmo.finished(options + ["-restart", reference.path("checkpoint_previous.h5")], ranks=2)
         with h5py.File(reference.path("checkpoint.h5")) as f:
@@ -564,6 +571,7 @@ class BadFiles(RestartCase):
                 (["-tube", "-tube_k1", "1"], ["of another scene", "-tube is 'off'"]),
                 (["-airflow", "off"], ["of another scene", "-airflow"]),
                 (["-energy_audit", "off"], ["of another scene", "-energy_audit"]),
+                (["-elements", "P1-P1"], ["of another scene", "-elements is 'P2-P1', here 'P1-P1'"]),
                 (["-quadrature_degree", "4"], ["of another scene", "-quadrature_degree"]),
                 (["-ventilator_pip", "7"], ["of another scene", "phase 1", "inspiration"]),
                 (["-ventilator_expiration", "0.4"], ["of another scene", "phase 2", "expiration", "0.3 to 0.6 s"]),

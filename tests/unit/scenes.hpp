@@ -110,6 +110,7 @@ PetscErrorCode for_each_dof(Run &run, Visit visit)
 {
   PetscSection section;
   PetscInt begin, end, n_fields;
+  std::vector<std::array<PetscReal, 3>> nodes;
 
   PetscFunctionBeginUser;
   PetscCall(DMGetLocalSection(run.model().dm(), &section));
@@ -117,13 +118,13 @@ PetscErrorCode for_each_dof(Run &run, Visit visit)
   PetscCall(PetscSectionGetNumFields(section, &n_fields));
   for (PetscInt p = begin; p < end; ++p)
     for (PetscInt f = 0; f < n_fields; ++f) {
-      PetscInt dof, offset;
-      PetscReal x[3];
+      PetscInt dof, offset, components;
+      PetscCall(PetscSectionGetFieldComponents(section, f, &components));
       PetscCall(PetscSectionGetFieldDof(section, p, f, &dof));
-      if (dof == 0) continue;
       PetscCall(PetscSectionGetFieldOffset(section, p, f, &offset));
-      PetscCall(run.scene().mesh().node_coordinates(p, x));
-      for (PetscInt c = 0; c < dof; ++c) visit(offset + c, f, c, x);
+      PetscCall(node_coordinates(run.model().dm(), p, dof / components, nodes));
+      for (const auto &x : nodes)
+        for (PetscInt c = 0; c < components; ++c) visit(offset++, f, c, x.data());
     }
   PetscFunctionReturn(PETSC_SUCCESS);
 }

@@ -471,6 +471,16 @@ TEST(Integration, AgreesWithPetscForDampedPressure)
   expect_same_integration(scene, 60, 1e-12);
 }
 
+TEST(Integration, AgreesWithPetscForOtherElements)
+{
+  for (const char *pair : {"P1-P1 -quadrature_degree 2", "P3-P2"})
+    for (bool airflow : {false, true}) {
+      SceneSpec scene = full_scene(airflow);
+      scene.more = std::string("-elements ") + pair;
+      expect_same_integration(scene, 70, 1e-12);
+    }
+}
+
 TEST(Integration, AgreesWithPetscForOtherDegreesOfQuadrature)
 {
   for (const char *degree : {"2", "4", "6"})

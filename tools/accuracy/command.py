@@ -57,6 +57,8 @@ def parse(words):
     parser.add_argument("--refine", type=int, default=None, metavar="N",
                         help="each mesh also cut in eight 1 ... N times (default: 1 if there is one mesh only, else 0)")
     parser.add_argument("--lung", type=float, nargs="+", metavar="MM", help="sizes of the built-in pair of lungs (default 30 21 15)")
+    parser.add_argument("--elements", nargs="+", choices=settings.ELEMENTS, default=[""], metavar="PAIR",
+                        help=f"element pairs, the base first: {' '.join(settings.ELEMENTS)} (default: the scene's alone)")
     parser.add_argument("--dt", type=float, help="the base's step, s (default: -ts_dt of the scene or solver file)")
     parser.add_argument("--dt-factors", type=float, nargs="+", default=[4, 2, 1, 0.5, 0.25, 0.125], help="default: 4 2 1 0.5 0.25 0.125")
     parser.add_argument("--schemes", nargs="+", choices=list(settings.SCHEMES), default=list(settings.SCHEMES))
@@ -78,7 +80,7 @@ def parse(words):
         options.asked = dict(map(question, options.question))
     except ValueError as error:
         fail(str(error))
-    for name in ("lung", "dt_factors", "schemes", "solvers", "tolerances", "numbers"):
+    for name in ("lung", "dt_factors", "schemes", "solvers", "tolerances", "numbers", "elements"):
         given = getattr(options, name)
         setattr(options, name, given and list(dict.fromkeys(given)))
     options.meshes = options.meshes and list({path.resolve(): path for path in options.meshes}.values())
@@ -109,7 +111,7 @@ def prepare(words, origins=None):
     options.origins = origins or {}
     require(options.build, [])
     scene = [word for name in options.scene for word in ("-options_file", str(scene_file(name)))]
-    settings.refuse_ours([*scene, *options.flags])
+    settings.refuse_ours([*scene, *options.flags], options.elements)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("tools/accuracy_cost: ended; finished runs are kept"))
     found, spent = axes(options, scene)
     named = list(options.asked) or [ALIASES.get(name, name) for name in options.numbers or []]

@@ -7,7 +7,7 @@ the smallest errors (the anchor) less its parts; its uncertainty is the sum of t
 A ladder of one level is not examined: its error is taken as 0 in the sums, and said to be missing wherever they are shown.
 """
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from .extrapolate import ROUNDING, Limit, limit
 from .settings import ORDERS, Setting
@@ -100,20 +100,32 @@ def in_time(values, axes):
     for scheme, found in limits.items():
         if found.uncertainty <= still < spread and found.order is None:
             limits[scheme] = Limit(found.value, spread, None, 1, found.how + ", not so the other scheme's")
-    converging = [found for found in limits.values() if found.order is not None]
-    chosen = min(converging or limits.values(), key=lambda found: found.uncertainty)
-    for other in converging or limits.values():
+    return limits, surest(limits.values(), "schemes")
+
+
+def surest(limits, of):
+    """The surest of several limits of one thing, wider if they contradict one another."""
+    converging = [found for found in limits if found.order is not None] or list(limits)
+    chosen = min(converging, key=lambda found: found.uncertainty)
+    for other in converging:
         apart = abs(other.value - chosen.value)
         if apart > other.uncertainty + chosen.uncertainty:
-            chosen = Limit(chosen.value, apart, chosen.order, chosen.levels, chosen.how + "; the schemes' limits differ")
-    return limits, chosen
+            chosen = Limit(chosen.value, apart, chosen.order, chosen.levels, f"{chosen.how}; the {of}' limits differ")
+    return chosen
 
 
 def in_space(values, axes):
-    ladder = [(m.size(), values[s]) for m in axes.meshes if (s := Setting(m, axes.base.steps, axes.base.solver)) in values]
-    if len(axes.meshes) == 1 and ladder:
-        return Limit(ladder[0][1], math.nan, None, 1, "one mesh given: not examined")
-    return limit(*zip(*ladder), 2)
+    """The surest of the element pairs' limits in space; of each pair a ladder of its own."""
+    limits = []
+    for elements in dict.fromkeys(m.elements for m in axes.meshes):
+        ladder = [(m.size(), values[s]) for m in axes.meshes
+                  if m.elements == elements and (s := Setting(m, axes.base.steps, axes.base.solver)) in values]
+        if ladder:
+            found = limit(*zip(*ladder), 2)
+            limits.append(replace(found, how=f"{elements}: {found.how}") if elements else found)
+    if len({m.cells for m in axes.meshes}) == 1 and limits:
+        return Limit(limits[0].value, math.nan, None, 1, "one mesh given: not examined")
+    return surest(limits, "elements")
 
 
 def of_solver(values, axes):

@@ -1,15 +1,17 @@
 """Limits of a number on a ladder of sizes, and how far they may be off.
 
 Richardson's extrapolation with the observed order of the three finest levels (Celik et al. 2008, J Fluids Eng 130:078001; ratios
-of sizes need not be equal); where these do not converge monotonically, a least-squares fit with the formal order (Eca &
-Hoekstra 2014, J Comput Phys 262:104). The grid convergence index of the finest value is F_s times its distance from the limit,
-F_s = 1.25 with an observed order, 3 without one or with one half as high again as the formal one; seen from the limit that leaves F_s - 1.
+of sizes need not be equal); where these do not converge monotonically, or with an order half as high again as the formal one (their
+last difference is small by chance), a least-squares fit with the formal order (Eca & Hoekstra 2014, J Comput Phys 262:104). The
+grid convergence index of the finest value is F_s times its distance from the limit, F_s = 1.25 with an observed order, 3 without one;
+seen from the limit that leaves F_s - 1.
 """
 import math
 from dataclasses import dataclass
 
 import numpy as np
 
+HIGHEST = 1.5    # observed order over the formal one up to which it is believed
 ROUNDING = 1e-8  # differences below this share of the number are the solver's, not the ladder's
 
 
@@ -59,9 +61,9 @@ def fitted(sizes, values, order):
 
 def three(sizes, values, formal):
     """Observed order, and limits with it and with the formal one; None if the levels tell no order of at least half of that
-    (at least 0.4)."""
+    (at least 0.4), or one so far above it that the last difference is small by chance."""
     p = observed_order(sizes, values)
-    if p is None or p < min(0.4, formal / 2):
+    if p is None or p < min(0.4, formal / 2) or p > HIGHEST * formal:
         return None
     return p, pair(sizes[1:], values[1:], p), pair(sizes[1:], values[1:], formal)
 
@@ -85,10 +87,12 @@ def limit(sizes, values, formal):
         value = others[0] if p <= formal else others[1]
         if len(values) > 3 and (before := three(sizes[-4:-1], values[-4:-1], formal)):
             others.append(before[1] if before[0] <= formal else before[2])
-        spread = max([(0.25 if p <= 1.5 * formal else 2) * abs(value - fine), *(abs(value - other) for other in others)])
+        spread = max([0.25 * abs(value - fine), *(abs(value - other) for other in others)])
         return Limit(value, max(spread, scale), p, 3, f"order {p:.2f} observed" + (f", {formal} used" if p > formal else ""))
     used = min(4, len(values))
     value, scatter = fitted(sizes[-used:], values[-used:], formal)
     last = abs(values[-1] - values[-2])
     growing = last if last > abs(values[-2] - values[-3]) else 0  # not yet where it converges
-    return Limit(value, max(2 * abs(value - fine) + 2 * scatter + growing, scale), None, used, f"no order seen, {formal} fitted")
+    seen = observed_order(sizes[-3:], values[-3:])
+    return Limit(value, max(2 * abs(value - fine) + 2 * scatter + growing, scale), None, used,
+                 f"order {seen:.2f} observed, {formal} fitted" if seen and seen > HIGHEST * formal else f"no order seen, {formal} fitted")

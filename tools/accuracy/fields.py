@@ -1,4 +1,4 @@
-"""Errors of the fields: displacement (P2) and pressure (P1) of one run against those of another, on any two meshes of one body.
+"""Errors of the fields: displacement and pressure, as the ten-node cells of the files have them, of one run against those of another, on any two meshes of one body.
 
 The integrals are over the reference's mesh, by a rule of Gauss and Jacobi in each tetrahedron that is exact for the square
 of two P2 fields on one mesh. The coarse cell of a point is found among those with the nearest centroids, by its

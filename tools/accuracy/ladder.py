@@ -13,6 +13,7 @@ START = 6e-5  # s per cell and step before anything is measured
 SETUP = 0.2   # s of a run that do not go with its cells and steps, at most half of the run
 GROWTH = {"iterative": 1.1, "iterative_ml": 1.1, "iterative_hypre": 1.1}  # exponent of the cost of a step over cells
 DIRECT = 1.5                                                             # of a factorisation
+OF_ELEMENTS = {"P1-P1": 0.25, "P3-P2": 7}  # cost of a cell over that of P2-P1
 
 
 @dataclass
@@ -74,6 +75,7 @@ class Ladder:
         """Seconds that a setting takes: what a cell and step took in the run nearest to it, growing with the cells."""
         work = self.steps_of(setting.steps) * setting.mesh.cells
         alike = [run for s, run in self.done.items() if s.solver == setting.solver] or list(self.done.values())
+        alike = [run for run in alike if run.setting.mesh.elements == setting.mesh.elements] or alike
         if not alike:
             return START * work * self.options.repeat
         near = min(alike, key=lambda run: abs(math.log(run.setting.mesh.cells / setting.mesh.cells)) +
@@ -81,6 +83,7 @@ class Ladder:
         took = self.seconds(near)
         setup = min(SETUP, took / 2)
         rate = (took - setup) / near.summary["steps"] / near.setting.mesh.cells
+        rate *= OF_ELEMENTS.get(setting.mesh.elements, 1) / OF_ELEMENTS.get(near.setting.mesh.elements, 1)
         exponent = GROWTH.get(setting.solver.file.stem, DIRECT) - 1
         return (setup + rate * work * (setting.mesh.cells / near.setting.mesh.cells) ** exponent) * self.options.repeat
 

@@ -15,10 +15,11 @@ from .pictures import logarithmic
 
 SPACE = re.compile(r"^  (\w+) +cube\w* +J [\d.]+  u (\S+)  Grad u (\S+)  p (\S+)  Grad p (\S+)", re.M)
 TIME = re.compile(r"^  (backward Euler|BDF2), (\w+) +dt 1/(\d+) +J [\d.]+  u (\S+)  p (\S+)", re.M)
-CASE = re.compile(r"^\[ RUN +\] ManufacturedRun/\w+\.(\w+)\n(.*?)^\[ ", re.M | re.S)
+CASE = re.compile(r"^\[ RUN +\] (?:Pairs/)?Manufactured\w+(?:/\w+)?\.(\w+?)(?:/(P\d)(P\d))?\n(.*?)^\[ ", re.M | re.S)
 CASES = {"DiscretisationError": "u and p of waves", "DiscretisationErrorOfDisplacement": "u of waves, p linear"}
-FORMAL = {"u": 2, "Grad u": 2, "p": 2, "Grad p": 1}
-LINEAR = {"u": 3, "Grad u": 2, "p": 3}  # p in its space
+FORMAL = {"": {"u": 2, "Grad u": 2, "p": 2, "Grad p": 1}, "P1-P1": {"u": 2, "Grad u": 1, "p": 2, "Grad p": 1},
+          "P3-P2": {"u": 3, "Grad u": 3, "p": 3, "Grad p": 2}}
+LINEAR = {"": {"u": 3, "Grad u": 2, "p": 3}, "P1-P1": {"u": 2, "Grad u": 1, "p": 2}, "P3-P2": {"u": 4, "Grad u": 3, "p": 4}}  # p in its space
 COLOURS = {"yoshihara": "#2a6fb0", "birzle": "#3b8f4a", "berger": "#c1272d", "ma": "#e08a1e"}
 
 
@@ -28,7 +29,7 @@ def output(build, results):
     if not program.exists():
         fail(f"{program} is not there; build the tests first: cmake --build {build} --target verification_mms")
     if not kept.exists() or kept.stat().st_mtime < program.stat().st_mtime:
-        run = subprocess.run([program, "--gtest_filter=ManufacturedRun*"], env=environment(), capture_output=True, text=True)
+        run = subprocess.run([program, "--gtest_filter=ManufacturedRun*:*ManufacturedElements*"], env=environment(), capture_output=True, text=True)
         if run.returncode:
             fail("verification_mms fails; run it alone to see why")
         results.mkdir(parents=True, exist_ok=True)
@@ -39,12 +40,13 @@ def output(build, results):
 def read(text):
     """(what, law, field) -> [(size, error)], coarse to fine, and the formal order of each."""
     ladders, formal = {}, {}
-    for case, body in CASE.findall(text):
+    for case, *degrees, body in CASE.findall(text):
+        pair = "-".join(filter(None, degrees))
         for law, *errors in SPACE.findall(body):
-            orders = LINEAR if case.endswith("Displacement") else FORMAL
+            orders = (LINEAR if case.endswith("Displacement") else FORMAL)[pair]
             for field, error in zip(("u", "Grad u", "p", "Grad p"), errors):
                 if field in orders:
-                    key = (f"h, {CASES[case]}", law, field)
+                    key = (f"h, {pair and pair + ', '}{CASES[case]}", law, field)
                     ladder = ladders.setdefault(key, [])
                     ladder.append((0.5 ** (len(ladder) + 1), float(error)))
                     formal[key] = orders[field]

@@ -13,13 +13,14 @@ FIGURES = {"ladders": pictures.ladders, "pareto": pictures.pareto, "costs": pict
 
 
 def field_errors(search):
-    """Errors of the fields by setting against the run with the smallest errors, at the snapshot with the most gas (runs without one
+    """Errors of the fields by setting against the run on the finest mesh, of those the one with the most unknowns, then with the smallest
+    errors (of P3 displacement the files hold the quadratic part alone), at the snapshot with the most gas (runs without one
     at that time are left out); and that run, None if there are no snapshots."""
     done = search.ladder.done
     errors = search.errors()
     if not errors or any(not (run.folder / "fields.xdmf").exists() for run in done.values()):
         return {}, None
-    reference = min(done.values(), key=lambda run: (-run.setting.mesh.cells, max(e.predicted(run.setting) for e in errors.values())))
+    reference = min(done.values(), key=lambda run: (-run.setting.mesh.cells, -run.summary["dofs"], max(e.predicted(run.setting) for e in errors.values())))
     volumes = benchmark_runs.waveform(reference.results[0])
     times = [time for time, *_ in fields.snapshots(reference.folder)]
     time = max(times, key=lambda t: volumes[min(volumes, key=lambda row: abs(row - t))][0])
@@ -32,7 +33,7 @@ def rows(search, found):
     """Header and rows of accuracy.csv; errors are shares of the limit, negative below it."""
     errors, base = search.all_errors(), search.axes.base
     keys = list(errors)
-    header = ["mesh", "scheme", "dt_s", "step_tolerance", "solver", "varied", "cells", "dofs", "steps", "rejected_steps", "newton_iterations",
+    header = ["mesh", "elements", "scheme", "dt_s", "step_tolerance", "solver", "varied", "cells", "dofs", "steps", "rejected_steps", "newton_iterations",
               "krylov_iterations", "cpu_s", "wall_s", "memory_mb", *keys, *(f"error_{k}" for k in keys),
               "error_u_l2", "error_u_h1", "error_p_l2", "outside_mesh"]
     table = []
@@ -41,7 +42,7 @@ def rows(search, found):
         varied = [name for name, part, of_base in (("mesh", setting.mesh, base.mesh), ("steps", setting.steps, base.steps),
                                                    ("solver", setting.solver, base.solver)) if part != of_base]
         field = found.get(setting, {})
-        table.append([setting.mesh.name, setting.steps.scheme, f"{setting.steps.dt:.6g}", f"{setting.steps.tolerance:.3g}", setting.solver.name,
+        table.append([setting.mesh.name, s["elements"], setting.steps.scheme, f"{setting.steps.dt:.6g}", f"{setting.steps.tolerance:.3g}", setting.solver.name,
                       "+".join(varied) or "base", s["cells"], s["dofs"], s["steps"], s["rejected_steps"], s["newton_iterations"],
                       s["krylov_iterations"], f"{run.cpu:.2f}", f"{run.wall:.2f}", f"{run.memory:.0f}",
                       *(f"{run.numbers[k]:.8g}" if k in run.numbers else "" for k in keys),

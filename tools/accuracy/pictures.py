@@ -12,6 +12,9 @@ KINDS = {("beuler", False): ("backward Euler", "o", "#2f6c9e"), ("bdf", False): 
          ("beuler", True): ("backward Euler, adaptive", "^", "#7fb2d6"), ("bdf", True): ("BDF2, adaptive", "v", "#e39a90")}
 
 
+FILLS = {"P1-P1": "none", "P3-P2": "top"}  # of markers; others are full
+
+
 def logarithmic(axis, **labels):
     """Both axes logarithmic, with few labels where x spans little."""
     axis.set(xscale="log", yscale="log", **labels)
@@ -27,16 +30,23 @@ def kind(setting):
     return KINDS[setting.steps.scheme, bool(setting.steps.tolerance)]
 
 
+def fill(elements):
+    return FILLS.get(elements, "full")
+
+
 def legend_handles(settings):
-    """One handle for each kind of steps among settings."""
-    return [plt.Line2D([], [], lw=0, marker=marker, color=colour, label=label)
-            for label, marker, colour in dict.fromkeys(map(kind, settings))]
+    """One handle for each kind of steps, and for each element pair if there are several, among settings."""
+    pairs = dict.fromkeys(s.mesh.elements for s in settings)
+    return [*(plt.Line2D([], [], lw=0, marker=marker, color=colour, label=label)
+              for label, marker, colour in dict.fromkeys(map(kind, settings))),
+            *(plt.Line2D([], [], lw=0, marker="o", color="#555555", fillstyle=fill(pair), label=pair)
+              for pair in pairs if len(pairs) > 1)]
 
 
 def point(axis, x, error, setting, shade=1.0):
     """An error that cannot be excluded."""
     _, marker, colour = kind(setting)
-    axis.plot(x, max(error, FLOOR), marker=marker, color=colour, ms=5, alpha=shade)
+    axis.plot(x, max(error, FLOOR), marker=marker, color=colour, ms=5, alpha=shade, fillstyle=fill(setting.mesh.elements))
 
 
 def shades(runs):
@@ -90,11 +100,14 @@ def ladders(path, search):
                     column[0].plot(*zip(*points), marker=marker, ms=4, lw=0.8, color=colour, label=label)
         column[0].axhspan(FLOOR, np.clip(e.shares["time"] / abs(e.value), FLOOR, 1), color="#eeeeee", zorder=0)
         logarithmic(column[0], xlabel="steps", title=short(key))
-        points = sorted((m.cells, max(abs(e.parts[m] / e.value), FLOOR)) for m in axes_.meshes if m in e.parts)
         if "space" in e.unexamined():
             column[1].text(0.5, 0.5, "not examined", ha="center", transform=column[1].transAxes, fontsize=8)
         else:
-            column[1].plot(*zip(*points), marker="D", ms=4, lw=0.8, color="#3b7d4f")
+            for pair in dict.fromkeys(m.elements for m in axes_.meshes):
+                points = sorted((m.cells, max(abs(e.parts[m] / e.value), FLOOR))
+                                for m in axes_.meshes if m.elements == pair and m in e.parts)
+                if points:
+                    column[1].plot(*zip(*points), marker="D", ms=4, lw=0.8, color="#3b7d4f", fillstyle=fill(pair), label=pair)
             column[1].axhspan(FLOOR, np.clip(e.shares["space"] / abs(e.value), FLOOR, 1), color="#eeeeee", zorder=0)
         logarithmic(column[1], xlabel="tetrahedra")
         for axis in column:
@@ -103,6 +116,8 @@ def ladders(path, search):
     axes[0][0].set_ylabel("error in time")
     axes[1][0].set_ylabel("error in space")
     axes[0][0].legend(fontsize=7)
+    if axes_.base.mesh.elements:
+        axes[1][0].legend(fontsize=7)
     save(figure, path, "Each ladder alone, against its own limit (grey: the limit's uncertainty)")
 
 
@@ -152,7 +167,7 @@ def digits(path, search):
         _, marker, colour = kind(run.setting)
         for axis, x, y in ((axes[0], np.log10(dofs), -np.log10(error)), (axes[1], np.log10(dofs), dofs / seconds),
                            (axes[2], np.log10(dofs), -np.log10(error * seconds)), (axes[3], seconds, -np.log10(error * seconds))):
-            axis.plot(x, y, marker=marker, color=colour, alpha=dark[run.setting.mesh.cells], ms=5)
+            axis.plot(x, y, marker=marker, color=colour, alpha=dark[run.setting.mesh.cells], ms=5, fillstyle=fill(run.setting.mesh.elements))
     for axis, x, y in zip(axes, ["DoS = log10(dofs)"] * 3 + ["time (s)"],
                           ["DoA = -log10(error)", "dofs / s", "DoE = -log10(error x s)", "DoE = -log10(error x s)"]):
         axis.set(xlabel=x, ylabel=y)

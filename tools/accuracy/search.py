@@ -88,7 +88,7 @@ class Search:
     def enough(self):
         """Whether the limits in space and time stand on three levels, or on all that there are: two show no order."""
         a = self.axes
-        least = {"space": min(EVIDENCE, len(a.meshes)),
+        least = {"space": min(EVIDENCE, max(sum(m.elements == one.elements for m in a.meshes) for one in a.meshes)),
                  "time": min(EVIDENCE, max(sum(t.scheme == s and not t.tolerance for t in a.steps) for s in ORDERS))}
         return all(e.limits[name].levels >= n for e in self.errors().values() for name, n in least.items())
 

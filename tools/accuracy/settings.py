@@ -20,6 +20,7 @@ from .numbers import percent
 ADAPTIVE = 1e-2     # largest error that a step may make in the ladder of adaptive steps, of V_T and PIP
 SCHEMES = {"beuler": "backward Euler", "bdf": "BDF2"}
 ORDERS = {"beuler": 1, "bdf": 2}
+ELEMENTS = ["P2-P1", "P1-P1", "P3-P2"]
 AIRWAY = 5          # size of the lung's cells over that of the airway's (tools/lung_mesh: 15 and 3 mm)
 ALIKE = 1.05        # meshes whose numbers of cells differ by less than this factor are no two levels
 OURS = {"-dm_refine": "the ladder in space refines meshes itself; use --refine",
@@ -32,11 +33,13 @@ OURS = {"-dm_refine": "the ladder in space refines meshes itself; use --refine",
 
 @dataclass(frozen=True)
 class Mesh:
-    """A level in space. words: options that give it. cells: tetrahedra. origin: what makes its file, for the reader."""
+    """A level in space. words: options that give it. cells: tetrahedra. origin: what makes its file, for the reader.
+    elements: the pair, empty if it is the scene's."""
     name: str
     words: tuple
     cells: int
     origin: str = ""
+    elements: str = ""
 
     def size(self):
         """Relative mean edge length."""
@@ -108,10 +111,11 @@ def names_of(words):
     return {word for word in with_files(words) if word.startswith("-")}
 
 
-def refuse_ours(words):
+def refuse_ours(words, elements):
     """Ends the program if the scene or the user's flags set what the ladders set."""
-    for name in sorted(names_of(words) & OURS.keys()):
-        fail(f"{name} cannot be among the options of the scene or after --: {OURS[name]}")
+    ours = OURS | ({"-elements": "--elements names the pairs"} if any(elements) else {})
+    for name in sorted(names_of(words) & ours.keys()):
+        fail(f"{name} cannot be among the options of the scene or after --: {ours[name]}")
 
 
 def plain_options(path):
@@ -166,11 +170,13 @@ def meshes(options, scene):
             fail(f"the mesh {path} has no tetrahedra")
         for level in range(options.refine + 1):
             refined = ("-dm_refine", str(level)) if level else ()
-            ladder.append(Mesh(path.stem + (f" refined {level} x" if level else ""), words + refined, cells * 8 ** level,
-                               origins.get(path, "")))
-    ladder.sort(key=lambda mesh: mesh.cells)
+            for elements in options.elements:
+                ladder.append(Mesh(" ".join([path.stem, *([f"refined {level} x"] if level else []), *([elements] if elements else [])]),
+                                   words + refined + (("-elements", elements) if elements else ()), cells * 8 ** level,
+                                   origins.get(path, ""), elements))
+    ladder.sort(key=lambda mesh: (options.elements.index(mesh.elements), mesh.cells))
     for coarse, fine in zip(ladder, ladder[1:]):
-        if fine.cells < ALIKE * coarse.cells:
+        if fine.elements == coarse.elements and fine.cells < ALIKE * coarse.cells:
             fail(f"the meshes {coarse.name} and {fine.name} have {coarse.cells} and {fine.cells} tetrahedra: levels of the ladder in "
                  f"space have to differ by {percent(ALIKE - 1)} at least")
     return ladder, seconds

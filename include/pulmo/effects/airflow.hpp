@@ -106,7 +106,7 @@ struct DarcyKernels {
   }
 };
 
-/// Alveolar pressure field (P1, kPa), its gas stress, mass balance and Darcy flux. Where the lung is open the
+/// Alveolar pressure field (kPa), its gas stress, mass balance and Darcy flux. Where the lung is open the
 /// ventilator holds p or prescribes the flux.
 class Airflow final : public Effect {
 public:
@@ -116,6 +116,8 @@ public:
   const char *about() const override { return "Darcy flow of alveolar air (mass balance, pressure field)"; }
   bool active() const override { return on_; }
   PetscReal porosity() const { return porosity_; }
+  /// Permeability over viscosity of the tissue at rest, mm^2/(kPa s).
+  PetscReal permeability_at_rest() const { return laws_[chosen_]->at_rest(); }
   /// Heat of the flow in a step, by point: quadratic in Grad p, kPa.
   EnergyDensity dissipation() const { return laws_[chosen_]->dissipation_callback(); }
 
@@ -160,7 +162,7 @@ public:
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
-  void fields(Composition &c) const override { c.field("pressure", 1, 1, "kPa"); }
+  void fields(Composition &c) const override { c.field("pressure", 1, c.elements().pressure, "kPa"); }
 
   PetscErrorCode terms(Composition &c, const SceneFacts &) const override
   {

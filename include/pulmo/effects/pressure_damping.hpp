@@ -1,9 +1,10 @@
 /// @file
 /// Effect `pressure_damping`: takes the ripples out of the pressure beside a jump that drains slowly.
 ///
-/// Adds  int h^2 / (6 M) Grad p_t . Grad q  to the mass balance (a perturbation of the flow equation as in Aguilar,
-/// Gaspar, Lisbona & Rodrigo 2008). In one dimension it turns the storage matrix of P1 pressure, M^-1 times the mass
-/// matrix, into its lumped form, for which the first step is monotone however small k dt is. It vanishes where the
+/// Adds  int h^2 / (c M) Grad p_t . Grad q  to the mass balance (a perturbation of the flow equation as in Aguilar,
+/// Gaspar, Lisbona & Rodrigo 2008). In one dimension it turns the storage matrix of P1 pressure into its lumped form,
+/// for which the first step is monotone however small k dt is: with c = 6 that of P2-P1, M^-1 times the mass matrix,
+/// with c = 4 (theirs) that of P1-P1, where the tissue sees only the mean pressure of a cell. It vanishes where the
 /// pressure is at rest and with h^2, the order of the pressure itself; q = 1 gives zero, so no air is lost or made.
 #pragma once
 
@@ -15,7 +16,7 @@ namespace pulmo {
 struct PressureDampingKernels {
   struct Parameters {
     static constexpr const char *owner = "pressure_damping";
-    PetscScalar beta; ///< h^2 / (6 M), mm^2/kPa
+    PetscScalar beta; ///< h^2 / (c M), mm^2/kPa
   };
 
   static void flux(const Point &point, const Parameters &k, PetscScalar f1[])
@@ -58,8 +59,10 @@ public:
   {
     PetscFunctionBeginUser;
     PulmoUserCheck(facts.airflow, options.comm(), "-pressure_damping needs a pressure field: give -airflow");
+    PulmoUserCheck(facts.elements.pressure == 1, options.comm(),
+                   "-pressure_damping is for linear pressure: leave it out, or give -elements P2-P1 or P1-P1");
     const PetscReal h = length_ > 0 ? length_ : 2 * mesh.length();
-    parameters_.beta = h * h / (6 * modulus_);
+    parameters_.beta = h * h / ((facts.elements.displacement == 1 ? 4 : 6) * modulus_);
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
@@ -70,7 +73,7 @@ public:
 
     PetscFunctionBeginUser;
     c.parameters(parameters_);
-    c.residual("h^2/(6 M) Grad p_t . Grad q", pressure, nullptr, volume_residual<P, K::flux>);
+    c.residual("h^2/(c M) Grad p_t . Grad q", pressure, nullptr, volume_residual<P, K::flux>);
     c.jacobian("damping", pressure, pressure, nullptr, nullptr, nullptr, volume_jacobian<P, K::flux_by_pressure>);
     c.energy(Energy::numerical, "numerical_dissipation", "", energy_density<P, K::loss>);
     PetscFunctionReturn(PETSC_SUCCESS);

@@ -9,7 +9,7 @@
 
 namespace pulmo {
 
-/// Displacement field (P2, mm) and the effective stress of the tissue law that the scene chose.
+/// Displacement field (mm) and the effective stress of the tissue law that the scene chose.
 class Tissue final : public Effect {
 public:
   explicit Tissue(std::vector<std::unique_ptr<TissueLaw>> laws) : laws_(std::move(laws)) {}
@@ -41,7 +41,7 @@ public:
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
-  void fields(Composition &c) const override { c.field("displacement", 3, 2, "mm"); }
+  void fields(Composition &c) const override { c.field("displacement", 3, c.elements().displacement, "mm"); }
 
   PetscErrorCode terms(Composition &c, const SceneFacts &) const override
   {
