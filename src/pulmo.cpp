@@ -3,7 +3,6 @@
 #include "pulmo/checkpoint.hpp"
 
 #include <algorithm>
-#include <cstring>
 
 namespace pulmo {
 
@@ -115,13 +114,13 @@ PetscErrorCode warn_of_no_air(MPI_Comm comm, const Scene &scene, const Simulatio
 /// by less than half a cell, k M dt < (h/2)^2. Says so, once.
 PetscErrorCode warn_of_equal_order(MPI_Comm comm, const Scene &scene, const Model &model, PetscReal dt, bool &warned)
 {
-  const Elements &elements = scene.facts().elements;
-  const PetscReal half_edge = scene.mesh().length(); // an edge is about twice the mean cell size
+  const SceneFacts &facts = scene.facts();
+  const Elements &elements = facts.elements;
+  const PetscReal half_edge = scene.mesh().edge() / 2;
 
   PetscFunctionBeginUser;
-  if (warned || !scene.facts().airflow || elements.displacement > elements.pressure) PetscFunctionReturn(PETSC_SUCCESS);
-  for (const Effect *effect : scene.active())
-    if (std::strcmp(effect->name(), "pressure_damping") == 0) PetscFunctionReturn(PETSC_SUCCESS);
+  if (warned || !facts.airflow || facts.pressure_damping || elements.displacement > elements.pressure)
+    PetscFunctionReturn(PETSC_SUCCESS);
   warned = scene.airflow().permeability_at_rest() * model.modulus() * dt < half_edge * half_edge;
   if (warned)
     PetscCall(PetscPrintf(comm,

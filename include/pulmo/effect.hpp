@@ -230,6 +230,7 @@ struct SceneFacts {
   std::shared_ptr<const Programme> ventilator; ///< null without a ventilator
   FlowSplit flow_split = FlowSplit::uniform;
   std::optional<AirwayResistance> tube; ///< between ventilator and airway
+  bool pressure_damping = false;        ///< ripples of the pressure are damped
 
   /// Whether some phase leaves the airway's pressure field free, with its flux prescribed.
   bool free_airway() const

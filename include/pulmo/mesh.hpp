@@ -37,9 +37,10 @@ public:
   PetscErrorCode read(const Options &options, bool ventilated);
 
   DM dm() const { return dm_; }
-  PetscReal volume() const { return volume_; } ///< mm^3, reference configuration
-  PetscReal length() const { return length_; } ///< mean cell size (volume per cell)^(1/3), mm
-  PetscInt cells() const { return cells_; }    ///< on all ranks
+  PetscReal volume() const { return volume_; }   ///< mm^3, reference configuration
+  PetscReal length() const { return length_; }   ///< mean cell size (volume per cell)^(1/3), mm
+  PetscReal edge() const { return 2 * length_; } ///< about the mean edge of a cell, mm
+  PetscInt cells() const { return cells_; }      ///< on all ranks
   const std::map<std::string, Surface> &surfaces() const { return surfaces_; }
   const Surface &surface(const std::string &name) const { return surfaces_.at(name); }
   /// The facets of a surface on this rank (mesh points).

@@ -6,7 +6,7 @@ from benchmarks.plots import plt, save
 
 from . import command, page
 from .extrapolate import limit, observed_order
-from .numbers import ALIASES, short
+from .numbers import KEYS, short
 from .pictures import logarithmic
 from .settings import ORDERS, SCHEMES, Setting
 
@@ -77,11 +77,10 @@ def table(searches):
 
 
 def draw(path, searches):
-    keys = [ALIASES[name] for name in ("V_T", "Q_peak", "C_rs", "R")]
-    figure, axes = plt.subplots(2, len(keys), figsize=(13, 6), layout="constrained")
+    figure, axes = plt.subplots(2, len(KEYS), figsize=(13, 6), layout="constrained")
     for law, search in searches.items():
         label, colour, _ = LAWS[law]
-        for column, key in zip(axes.T, keys):
+        for column, key in zip(axes.T, KEYS):
             e = search.errors().get(key)
             if e is None:
                 continue
@@ -92,7 +91,7 @@ def draw(path, searches):
             points = [(m.cells, abs(e.parts[m] / e.value)) for m in search.axes.meshes if m in e.parts]
             if points:
                 column[1].plot(*zip(*points), "D-", ms=4, lw=0.8, color=colour)
-    for column, key in zip(axes.T, keys):
+    for column, key in zip(axes.T, KEYS):
         logarithmic(column[0], xlabel="Δt (s)", title=short(key))
         logarithmic(column[1], xlabel="tetrahedra")
     axes[0][0].set_ylabel("error in time")

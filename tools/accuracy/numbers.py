@@ -3,6 +3,7 @@ import re
 
 ALIASES = {"V_T": "tidal_volume_ml", "Q_peak": "peak_flow_ml_per_s", "C_rs": "compliance_ml_per_cmH2O",
            "R": "resistance_cmH2O_s_per_l", "PIP": "peak_inspiratory_pressure_cmH2O"}
+KEYS = [ALIASES[name] for name in ("V_T", "Q_peak", "C_rs", "R")]  # those that a pressure-controlled breath does not prescribe
 SHORT = {key: alias for alias, key in ALIASES.items()}
 LEVELS = (0.05, 0.01, 0.001)
 NOT_CLINICAL = {"reference_volume_ml", "functional_residual_capacity_ml"}  # of the mesh, not of the breath

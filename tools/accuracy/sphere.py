@@ -9,7 +9,7 @@ from benchmarks.plots import plt, save
 
 from . import command, truth
 from .extrapolate import limit as limit_of
-from .numbers import ALIASES, short
+from .numbers import ALIASES, KEYS, short
 from .pictures import logarithmic
 from .settings import ELEMENTS, ORDERS, SCHEMES, Setting, Steps
 
@@ -119,14 +119,13 @@ def by_elements(search):
     """Table: true errors in space and cost of each pair of elements, at the base's step."""
     base = search.axes.base
     true = truth.euler_numbers(base.steps.dt)
-    keys = [ALIASES[name] for name in ("V_T", "Q_peak", "C_rs", "R")]
-    header = ["elements", "tets", "dofs", "CPU s", *(f"{short(key)}: off by %" for key in keys), "steps taken again"]
+    header = ["elements", "tets", "dofs", "CPU s", *(f"{short(key)}: off by %" for key in KEYS), "steps taken again"]
     rows = []
     for mesh in search.axes.meshes:
         run = search.ladder.done.get(Setting(mesh, base.steps, base.solver))
         if run:
             rows.append([mesh.elements, mesh.cells, run.summary["dofs"], f"{run.cpu:.3g}",
-                         *(f"{100 * (run.numbers[key] / exact(key, true) - 1):+.3f}" for key in keys), run.summary["rejected_steps"]])
+                         *(f"{100 * (run.numbers[key] / exact(key, true) - 1):+.3f}" for key in KEYS), run.summary["rejected_steps"]])
     return header, rows
 
 

@@ -55,13 +55,19 @@ public:
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
+  PetscErrorCode announce(SceneFacts &facts) override
+  {
+    facts.pressure_damping = true;
+    return PETSC_SUCCESS;
+  }
+
   PetscErrorCode check(const Options &options, const Mesh &mesh, const SceneFacts &facts) override
   {
     PetscFunctionBeginUser;
     PulmoUserCheck(facts.airflow, options.comm(), "-pressure_damping needs a pressure field: give -airflow");
     PulmoUserCheck(facts.elements.pressure == 1, options.comm(),
                    "-pressure_damping is for linear pressure: leave it out, or give -elements P2-P1 or P1-P1");
-    const PetscReal h = length_ > 0 ? length_ : 2 * mesh.length();
+    const PetscReal h = length_ > 0 ? length_ : mesh.edge();
     parameters_.beta = h * h / ((facts.elements.displacement == 1 ? 4 : 6) * modulus_);
     PetscFunctionReturn(PETSC_SUCCESS);
   }

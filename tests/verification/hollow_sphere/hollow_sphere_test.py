@@ -19,8 +19,6 @@ from radial import ML, Birzle, Pressure, Radial, Shell, breathe  # noqa: E402
 
 BREATH = Pressure()
 SCENE = pulmo.options_file("scenes/hollow_sphere.opts")
-ROLLERS = ["-support", "-support_surfaces", "x0,y0,z0", "-support_components_x0", "x", "-support_components_y0", "y",
-           "-support_components_z0", "z"]
 # one factorisation serves five Newton steps as preconditioner
 SOLVER = pulmo.DIRECT + ["-snes_rtol", "1e-7", "-ksp_type", "fgmres", "-ksp_rtol", "1e-4", "-snes_lag_preconditioner", "5",
                          "-snes_lag_preconditioner_persists"]
@@ -148,7 +146,7 @@ class PulmoAgainstRadial(unittest.TestCase):
         mesh = pulmo.scratch("octant.msh")
         subprocess.run([os.path.join(pulmo.SOURCE, "tools", "sphere_mesh"), "--divisions", str(divisions), "--layers",
                         str(layers), "--octant", "--output", mesh], check=True, capture_output=True)
-        return pulmo.finished(SOLVER + SCENE + ROLLERS + ["-dm_plex_filename", mesh] + more).signals()
+        return pulmo.finished(SOLVER + SCENE + pulmo.ROLLERS + ["-dm_plex_filename", mesh] + more).signals()
 
     def test_scene(self):
         """The scene file is the breath that the radial solver takes."""
