@@ -98,7 +98,7 @@ bool read_text(hid_t file, const std::string &name, std::string &text)
   return true;
 }
 
-/// Opens a file for reading. @p complaint: what is wrong with it and how to mend it.
+/// Opens a file for reading. @p complaint: what is wrong with it and how to fix it.
 hid_t open_file(const std::string &name, std::string &complaint)
 {
   std::error_code error;

@@ -123,10 +123,11 @@ PetscErrorCode warn_of_equal_order(MPI_Comm comm, const Scene &scene, const Mode
     PetscFunctionReturn(PETSC_SUCCESS);
   warned = scene.airflow().permeability_at_rest() * model.modulus() * dt < half_edge * half_edge;
   if (warned)
-    PetscCall(PetscPrintf(comm,
-                          "pulmo: warning: in a step of %g s pressure spreads by less than half a cell, where "
-                          "-elements %s is not stable: look for ripples, or give -pressure_damping\n",
-                          (double)dt, elements.name()));
+    PetscCall(
+        PetscPrintf(comm,
+                    "pulmo: warning: in a step of %g s pressure spreads by less than half a cell, where "
+                    "-elements %s is not stable: look for a pressure that oscillates, or give -pressure_damping\n",
+                    (double)dt, elements.name()));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -230,7 +230,7 @@ struct SceneFacts {
   std::shared_ptr<const Programme> ventilator; ///< null without a ventilator
   FlowSplit flow_split = FlowSplit::uniform;
   std::optional<AirwayResistance> tube; ///< between ventilator and airway
-  bool pressure_damping = false;        ///< ripples of the pressure are damped
+  bool pressure_damping = false;        ///< oscillations of the pressure are damped
 
   /// Whether some phase leaves the airway's pressure field free, with its flux prescribed.
   bool free_airway() const
@@ -259,7 +259,7 @@ public:
   virtual bool active() const = 0;
   /// Tells the other effects what they may need to know.
   virtual PetscErrorCode announce(SceneFacts &) { return PETSC_SUCCESS; }
-  /// Checks against the mesh and the other effects; errors name the option and the mend.
+  /// Checks against the mesh and the other effects; errors name the option and how to fix it.
   virtual PetscErrorCode check(const Options &, const Mesh &, const SceneFacts &) { return PETSC_SUCCESS; }
   /// Adds its fields.
   virtual void fields(Composition &) const {}

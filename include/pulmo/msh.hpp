@@ -7,7 +7,7 @@
 namespace pulmo {
 
 /// What is wrong with the bytes @p content of an MSH file (2.2 or 4.1, ASCII or binary), as the words that follow its
-/// name in a sentence that tells the mend; empty if nothing is. PETSc's reader trusts the counts, tags and node numbers
+/// name in a sentence that says how to fix it; empty if nothing is. PETSc's reader trusts the counts, tags and node numbers
 /// of a file; what passes here is safe for it and is a mesh of linear tetrahedra and of their faces.
 std::string msh_fault(const std::string &content);
 

@@ -35,7 +35,7 @@ const std::vector<std::string> &petsc_names();
 /// Declares and reads pulmo's own options from PETSc's database.
 ///
 /// Every function reads the option `-<group>_<name>` (or `-<group>` for an empty name) into @p value, whose
-/// content on entry is the default. Errors are user errors that name the option and the mend.
+/// content on entry is the default. Errors are user errors that name the option and how to fix it.
 class Options {
 public:
   explicit Options(MPI_Comm comm) : comm_(comm) {}

@@ -1,5 +1,5 @@
 /// @file
-/// PETSc as pulmo uses it: version compatibility, owning handles, errors that a user can mend.
+/// PETSc as pulmo uses it: version compatibility, owning handles, errors that a user can fix.
 #pragma once
 
 #include <petscdmplex.h>
@@ -20,7 +20,7 @@
 #define PETSC_SUCCESS static_cast<PetscErrorCode>(0)
 #endif
 
-/// Ends the calling function with an error that the user can mend: one sentence, no stack trace.
+/// Ends the calling function with an error that the user can fix: one sentence, no stack trace.
 /// Collective: every rank of the communicator must reach it with the same message.
 #define PulmoUserError(comm, ...) SETERRQ(comm, PETSC_ERR_USER_INPUT, __VA_ARGS__)
 

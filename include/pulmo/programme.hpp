@@ -58,8 +58,8 @@ private:
   std::vector<Phase> phases_;
 };
 
-/// Reads a programme of phases from a text file (docs/ventilator.md tells its grammar). User errors name file, line
-/// and mend; @p option is the one that named the file. Collective: one rank reads.
+/// Reads a programme of phases from a text file (docs/ventilator.md tells its grammar). User errors name file and line
+/// and say how to fix it; @p option is the one that named the file. Collective: one rank reads.
 PetscErrorCode read_programme(MPI_Comm comm, const std::string &option, const std::string &file,
                               std::vector<Phase> &phases);
 /// The same from text that was read already.

@@ -23,7 +23,7 @@ COMPARED = ["airway_pressure_cmH2O", "flow_ml_per_s", "volume_ml", "min_J", "max
 TURNED = Rotation.from_rotvec([2.4, 0.6, -0.9])
 SHIFT = np.array([310.0, -45.0, 120.0])  # mm
 
-# p = dW/dJ of F = J^(1/3) I, kPa (Table 1 with the slips mended)
+# p = dW/dJ of F = J^(1/3) I, kPa (Table 1 with the slips corrected)
 INFLATION = {
     "ma": lambda J: 2 * np.exp(G_MA * (J ** (2 / 3) - 1) ** 2) * 2 * G_MA * (J ** (2 / 3) - 1) * 2 / 3 * J ** (-1 / 3),
     "birzle": lambda J: (2 * 0.3567 * (J ** (-1 / 3) - J ** (-2 * 1.075 - 1))

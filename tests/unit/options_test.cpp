@@ -1,4 +1,4 @@
-// The options database: parsing, ranges, mistakes that must end the run with a sentence that names the mend.
+// The options database: parsing, ranges, mistakes that must end the run with a sentence that says how to fix it.
 #include "unit/scenes.hpp"
 
 #include "pulmo/effects/chest_wall.hpp"
@@ -234,10 +234,10 @@ TEST(SceneOptions, OptionsOfInactiveEffectsAreErrors)
                                                          {"-lumen_pressure_surfaces x1", "-lumen_pressure"},
                                                          {"-support_rigid", "-support"},
                                                          {"-traction_value 1,0,0", "-traction"}};
-  for (const auto &[given, mend] : cases) {
+  for (const auto &[given, cure] : cases) {
     const std::string text = scene_error(given);
     EXPECT_HAS(text, "has no effect in this scene");
-    EXPECT_HAS(text, std::string("needs ") + mend);
+    EXPECT_HAS(text, std::string("needs ") + cure);
   }
   EXPECT_EQ(scene_error("-chest_wall off -airflow off -ventilator off"), "");
 }

@@ -63,7 +63,7 @@ def pressures(run):
       "eight permeabilities, iterative.opts")
 def tight(lab):
     """The layer that drains in the first step is thinner than a cell. P2–P1 is inf-sup stable, so the pressure stays
-    bounded, but a jump that the mesh cannot show leaves ripples beside it (Vermeer & Verruijt 1981)."""
+    bounded, but a jump that the mesh cannot show leaves oscillations beside it (Vermeer & Verruijt 1981)."""
     length, h, dt = 100.0, 4.5, 0.05  # mm, mm, s
     errors = {}
     for damped in ("", " damped"):

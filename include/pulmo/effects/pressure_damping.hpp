@@ -1,5 +1,5 @@
 /// @file
-/// Effect `pressure_damping`: takes the ripples out of the pressure beside a jump that drains slowly.
+/// Effect `pressure_damping`: takes the oscillation out of the pressure beside a jump that drains slowly.
 ///
 /// Adds  int h^2 / (c M) Grad p_t . Grad q  to the mass balance (a perturbation of the flow equation as in Aguilar,
 /// Gaspar, Lisbona & Rodrigo 2008). In one dimension it turns the storage matrix of P1 pressure into its lumped form,
@@ -39,14 +39,14 @@ struct PressureDampingKernels {
 class PressureDamping final : public Effect {
 public:
   const char *name() const override { return "pressure_damping"; }
-  const char *about() const override { return "no ripples of pressure at very low permeability (numerical)"; }
+  const char *about() const override { return "no oscillating pressure at very low permeability (numerical)"; }
   bool active() const override { return on_; }
 
   PetscErrorCode declare(Options &options) override
   {
     PetscFunctionBeginUser;
     options.group(name(), about());
-    PetscCall(options.flag("", "damp ripples of the pressure", on_));
+    PetscCall(options.flag("", "damp oscillations of the pressure", on_));
     options.group(name(), about(), on_, "-pressure_damping");
     PetscCall(options.real("length", "mm", Range::not_negative(), "edge of a cell, h (0: twice the mean cell size)",
                            length_));
