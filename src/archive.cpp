@@ -12,7 +12,7 @@ namespace {
 
 /// Marks a file of pulmo, and tells how to read it. Raise it when a name or a meaning changes.
 constexpr const char *marker = "pulmo_checkpoint";
-constexpr int format = 1;
+constexpr int format = 2; // 2: the names of the mesh
 
 /// Entries of a dataset that have one checksum.
 constexpr hsize_t chunk_rows = 1 << 16;

@@ -1,5 +1,7 @@
 #include "pulmo/checkpoint.hpp"
 
+#include "pulmo/named_parts.hpp"
+
 #include <algorithm>
 #include <array>
 #include <cerrno>
@@ -187,11 +189,29 @@ PetscErrorCode Checkpoint::persist_scene(Archive &archive)
                  "-restart %s is a checkpoint of another mesh (%s; this one: %s, coordinates in mm); give that run's "
                  "-dm_plex_filename and -mesh_scale",
                  restart_.c_str(), mesh.c_str(), order_.identity().c_str());
+  PetscCall(persist_names(archive));
   for (const auto &[name, value] : options_.own_used())
     if (!is_free(name)) options += name + " " + value + "\n";
   PetscCall(archive.text("options", options));
   if (archive.reading()) PetscCall(compare_options(options));
   PetscCall(persist_programme(archive));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Checkpoint::persist_names(Archive &archive)
+{
+  std::vector<NamedPart> here, there;
+  std::string text;
+
+  PetscFunctionBeginUser;
+  PetscCall(find_named_parts(scene_.mesh(), here));
+  text = text_of(here);
+  PetscCall(archive.text("names", text));
+  PetscCall(archive.check(read_named_parts(text, there), "names"));
+  const std::string differs = difference(there, here);
+  PulmoUserCheck(differs.empty(), options_.comm(),
+                 "-restart %s is a checkpoint of a mesh with other names: %s; give the mesh of that run",
+                 restart_.c_str(), differs.c_str());
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

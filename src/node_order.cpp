@@ -45,25 +45,19 @@ std::uint64_t hash(const double x[3])
 /// For each mesh point a number made of the corners of all cells around it, complete on the rank that owns the point.
 PetscErrorCode hash_cells(DM dm, std::vector<std::uint64_t> &around)
 {
-  PetscInt end, cell_begin, cell_end, vertex_begin, vertex_end, roots;
+  PetscInt end, cell_begin, cell_end, roots;
   PetscSF sf;
 
   PetscFunctionBeginUser;
   PetscCall(DMPlexGetChart(dm, nullptr, &end));
   PetscCall(DMPlexGetHeightStratum(dm, 0, &cell_begin, &cell_end));
-  PetscCall(DMPlexGetDepthStratum(dm, 0, &vertex_begin, &vertex_end));
   around.assign(static_cast<std::size_t>(end), 0);
   for (PetscInt c = cell_begin; c < cell_end; ++c) {
     PetscInt *closure = nullptr, n;
-    std::uint64_t corners = 0;
+    std::uint64_t corners;
+    PetscCall(hash_corners(dm, c, corners));
     PetscCall(DMPlexGetTransitiveClosure(dm, c, PETSC_TRUE, &n, &closure));
-    for (PetscInt i = 0; i < n; ++i) {
-      PetscReal x[3];
-      if (closure[2 * i] < vertex_begin || closure[2 * i] >= vertex_end) continue;
-      PetscCall(node_coordinates(dm, closure[2 * i], x));
-      corners += hash(x);
-    }
-    for (PetscInt i = 0; i < n; ++i) around[closure[2 * i]] ^= scramble(corners);
+    for (PetscInt i = 0; i < n; ++i) around[closure[2 * i]] ^= corners;
     PetscCall(DMPlexRestoreTransitiveClosure(dm, c, PETSC_TRUE, &n, &closure));
   }
   PetscCall(DMGetPointSF(dm, &sf));
@@ -132,6 +126,25 @@ std::vector<PetscMPIInt> starts(const std::vector<PetscMPIInt> &counts)
 }
 
 } // namespace
+
+PetscErrorCode hash_corners(DM dm, PetscInt point, std::uint64_t &h)
+{
+  PetscInt begin, end, n, *closure = nullptr;
+  std::uint64_t sum = 0; // whatever the order of the corners
+
+  PetscFunctionBeginUser;
+  PetscCall(DMPlexGetDepthStratum(dm, 0, &begin, &end));
+  PetscCall(DMPlexGetTransitiveClosure(dm, point, PETSC_TRUE, &n, &closure));
+  for (PetscInt i = 0; i < n; ++i) {
+    PetscReal x[3];
+    if (closure[2 * i] < begin || closure[2 * i] >= end) continue;
+    PetscCall(node_coordinates(dm, closure[2 * i], x));
+    sum += hash(x);
+  }
+  PetscCall(DMPlexRestoreTransitiveClosure(dm, point, PETSC_TRUE, &n, &closure));
+  h = scramble(sum);
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
 
 PetscErrorCode owned_points(DM dm, PetscInt dimension, std::vector<PetscInt> &points)
 {

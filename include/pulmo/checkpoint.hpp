@@ -33,6 +33,8 @@ public:
 private:
   /// Marks, scene and mesh: written, or read and compared.
   PetscErrorCode persist_scene(Archive &archive);
+  /// Which facets and cells have which names.
+  PetscErrorCode persist_names(Archive &archive);
   PetscErrorCode compare_options(const std::string &stored) const;
   PetscErrorCode persist_programme(Archive &archive);
   PetscErrorCode compare_programme(const std::vector<Phase> &stored, PetscReal time) const;

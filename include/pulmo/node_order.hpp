@@ -12,6 +12,9 @@ namespace pulmo {
 /// Mesh points of @p dm below dimension @p dimension (vertices, then edges, then faces) that this rank owns.
 PetscErrorCode owned_points(DM dm, PetscInt dimension, std::vector<PetscInt> &points);
 
+/// A number made of the coordinates of a mesh point's corners, whatever their order.
+PetscErrorCode hash_corners(DM dm, PetscInt point, std::uint64_t &h);
+
 /// Mesh points sorted by kind (vertices, edges, faces), coordinates and, where several lie at one place (the two sides
 /// of a fissure), by the cells around them. Values of their nodes travel to rank 0 in that order, and back.
 class NodeOrder {

@@ -319,6 +319,54 @@ class Meshes(RestartCase):
         self.assertLess(u.min(), -0.1, "the sides of the fissure move differently")
         self.expect_same(reference, other, OTHER_RANKS, after=0.45)
 
+    def joined(self):
+        """Cells and tags of a kind, of which the file may have several blocks."""
+        return {kind: [np.concatenate([block[i] for block in self.blocks if block[0] == kind]) for i in (1, 2)]
+                for kind in ("triangle", "tetra")}
+
+    def mesh_with(self, tags=None, names=None):
+        """Options for the cube with other tags of its facets ("triangle") or cells ("tetra"), and other names."""
+        blocks = [(kind, cells, (tags or {}).get(kind, old)) for kind, (cells, old) in self.joined().items()]
+        return case_meshes.save(self.points, blocks, names or self.names) + ["-mesh_scale", "1"]
+
+    def test_names(self):
+        """Which facets and cells a name marks is part of the scene, whatever the numbers of the file say."""
+        airway, pleura, lung = (self.names[n][0] for n in ("airway", "pleura", "lung"))
+        (facets, of_facet), (cells, of_cell) = self.joined().values()
+        inside, elsewhere = (np.flatnonzero(of_facet == tag) for tag in (airway, pleura))
+
+        def marked(chosen):
+            return {"triangle": np.where(np.isin(np.arange(len(facets)), chosen), airway, pleura)}
+
+        half = {"tetra": np.where(self.points[cells].mean(axis=1)[:, 1] < np.median(self.points[:, 1]), lung, 9)}
+        two = {**self.names, "upper": [9, 3]}
+        other_half = {"tetra": np.where(half["tetra"] == 9, lung, 9)}
+        n, c = len(inside), len(cells)
+        again = PCV + ["-ts_max_time", "0.2", "-checkpoint_every", "0.1"]
+        reference = pulmo.finished(again)
+        split = pulmo.finished(again + self.mesh_with(half, two))
+        upper = int((half["tetra"] == 9).sum())
+        wall = ["-chest_wall_surfaces", "wall"]
+        for start, options, words, ranks in (
+                (reference, self.mesh_with(marked(elsewhere[:n])), f"there the surface 'airway' has {n} facets, here as many, but others", 2),
+                (reference, self.mesh_with(marked(inside[1:])), f"there the surface 'airway' has {n} facets, here {n - 1}", 1),
+                (reference, self.mesh_with(names={"airway": [airway, 2], "wall": [pleura, 2], "lung": [lung, 3]}) + wall,
+                 f"there the surface 'pleura' has {len(facets) - n} facets, here they are called 'wall'", 1),
+                (reference, self.mesh_with(half, two), f"there the volume 'lung' has {c} cells, here {c - upper}", 2),
+                (split, self.mesh_with(other_half, two), "there the volume 'lung' has", 1),
+                (split, self.mesh_with(half, {**self.names, "right": [9, 3]}),
+                 f"there the volume 'upper' has {upper} cells, here they are called 'right'", 1),
+                (split, self.mesh_with(half), f"there the volume 'upper' has {upper} cells, here", 1)):
+            with self.subTest(words):
+                case = pulmo.Case(PCV + options + ["-restart", start.path("checkpoint.h5")], ranks=ranks)
+                self.expect_error(case.code, case.err, "of a mesh with other names", words, "give the mesh of that run")
+                self.assertFalse(os.path.exists(case.directory), "something was touched")
+        # numbers of groups are free, and so is what the file names beside surfaces and volumes
+        renamed = {"triangle": of_facet + 20, "tetra": of_cell + 20}
+        free = self.mesh_with(renamed, {n: [t + 20, d] for n, (t, d) in self.names.items()} | {"edge": [50, 1]})
+        for ranks in (1, 3):
+            pulmo.finished(PCV + free + ["-ts_max_time", "0.25", "-restart", reference.path("checkpoint.h5")], ranks=ranks)
+
 
 class Signals(RestartCase):
     """Asked to stop, a run leaves a checkpoint after the step at hand."""
@@ -540,10 +588,13 @@ class BadFiles(RestartCase):
                 self.refused(self.file(self.image[:length]), word, ranks=2 if length == 100 else 1)
 
     def test_spoilt(self):
-        def next_format(f):
-            f.attrs.modify("pulmo_checkpoint", np.int32(f.attrs["pulmo_checkpoint"] + 1))
+        with h5py.File(self.good) as f:
+            written = int(f.attrs["pulmo_checkpoint"])
 
-        self.refused(self.changed(next_format), "has format 2", "reads format 1")
+        for other in (written - 1, written + 1):
+            def reformat(f):
+                f.attrs.modify("pulmo_checkpoint", np.int32(other))
+            self.refused(self.changed(reformat), f"has format {other}", f"reads format {written}")
         for name in ("signals", "state/pressure", "scalars"):
             with self.subTest(name):
                 def drop(f):
