@@ -55,42 +55,47 @@ PetscErrorCode Output::declare(Options &options)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+std::string Output::occupied(bool continues) const
+{
+  std::error_code error;
+  std::string left; // a checkpoint of an earlier run
+  if (overwrite_) return "";
+  if (fs::exists(path("summary.json"), error))
+    return "-output_dir " + directory_ + " holds a finished run; give another directory or -output_overwrite";
+  for (const char *name : {"checkpoint_previous.h5", "checkpoint.h5"})
+    if (fs::exists(path(name), error)) left = path(name);
+  return continues || left.empty()
+             ? ""
+             : "-output_dir " + directory_ + " holds the checkpoint of an unfinished run: go on with -restart " + left +
+                   ", or give another directory or -output_overwrite";
+}
+
 PetscErrorCode Output::prepare(const Options &options, const std::string &restart, const std::vector<std::string> &kept)
 {
   const MPI_Comm comm = options.comm();
   PetscMPIInt rank;
-  bool free = true, unfinished = false, writable = true, continues = false;
-  std::string left; // a checkpoint of an earlier run
+  bool continues = false;
+  std::string complaint, left_by;
 
   PetscFunctionBeginUser;
   PetscCallMPI(MPI_Comm_rank(comm, &rank));
   if (rank == 0) {
     std::error_code error;
     continues = !restart.empty() && fs::equivalent(fs::absolute(restart).parent_path(), directory_, error) && !error;
-    free = overwrite_ || !fs::exists(path("summary.json"), error);
-    for (const char *name : {"checkpoint_previous.h5", "checkpoint.h5"})
-      if (fs::exists(path(name), error)) left = path(name);
-    unfinished = !overwrite_ && !continues && !left.empty();
-    if (free && !unfinished) {
+    complaint = RunLock::user_of(directory_);
+    if (complaint.empty()) complaint = occupied(continues);
+    if (complaint.empty()) {
       fs::create_directories(directory_, error);
-      const std::string probe = path(".pulmo_probe");
-      std::FILE *f = std::fopen(probe.c_str(), "w");
-      writable = f && std::fputs("pulmo\n", f) >= 0;
-      if (f) writable = std::fclose(f) == 0 && writable;
-      fs::remove(probe, error);
+      complaint = lock_.take(directory_);
+      if (complaint.empty()) complaint = occupied(continues); // by a run that has just ended
+      left_by = lock_.left_by();
     }
   }
-  PetscCall(from_root(comm, free));
-  PetscCall(from_root(comm, unfinished));
-  PetscCall(from_root(comm, writable));
-  PulmoUserCheck(free, comm, "-output_dir %s holds a finished run; give another directory or -output_overwrite",
-                 directory_.c_str());
-  PulmoUserCheck(!unfinished, comm,
-                 "-output_dir %s holds the checkpoint of an unfinished run: go on with -restart %s, or give another "
-                 "directory or -output_overwrite",
-                 directory_.c_str(), left.c_str());
-  PulmoUserCheck(writable, comm, "-output_dir %s cannot be written; choose another directory or free the disk",
-                 directory_.c_str());
+  PetscCall(from_root(comm, complaint));
+  PulmoUserCheck(complaint.empty(), comm, "%s", complaint.c_str());
+  if (!left_by.empty())
+    PetscCall(PetscPrintf(comm, "pulmo: note: the run that worked in %s before was killed (%s)\n", directory_.c_str(),
+                          left_by.c_str()));
   if (rank == 0) { // what an earlier run left must not pass for this one's
     std::error_code error;
     std::vector<fs::path> old;

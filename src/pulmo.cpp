@@ -48,6 +48,13 @@ PetscErrorCode handle_error(MPI_Comm comm, int line, const char *function, const
   return PETSC_ERR_USER_INPUT; // callers get what the handler returns
 }
 
+/// Ends a process as PETSc does, but leaves no lock.
+PetscErrorCode handle_signal(int signal, void *)
+{
+  RunLock::abandon();
+  return PetscSignalHandlerDefault(signal, nullptr);
+}
+
 /// Tissue stiffness that scales the equations: the largest diagonal entry of dP'/dF at F = I, kPa.
 PetscReal reference_modulus(const TissueLaw &law)
 {
@@ -153,7 +160,11 @@ PetscErrorCode check_held(MPI_Comm comm, const Scene &scene, const Composition &
 
 PetscErrorCode initialize()
 {
+  PetscBool no_handler = PETSC_FALSE;
+
   PetscFunctionBeginUser;
+  PetscCall(PetscOptionsGetBool(nullptr, nullptr, "-no_signal_handler", &no_handler, nullptr));
+  if (!no_handler) PetscCall(PetscPushSignalHandler(handle_signal, nullptr));
   PetscCall(PetscPushErrorHandler(handle_error, nullptr));
   PetscCall(register_fe_type());
   PetscCall(register_metis_partitioner());

@@ -1,5 +1,7 @@
 #include "pulmo/stop_signal.hpp"
 
+#include "pulmo/run_lock.hpp"
+
 #include <array>
 #include <csignal>
 #include <ctime>
@@ -25,6 +27,7 @@ void note(int signal)
     received = signal;
     received_at = now;
   } else if (now - received_at >= again_after) {
+    RunLock::abandon();
     std::signal(signal, SIG_DFL);
     std::raise(signal);
   }

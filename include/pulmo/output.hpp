@@ -5,6 +5,7 @@
 #include "pulmo/energy.hpp"
 #include "pulmo/error_estimate.hpp"
 #include "pulmo/regions.hpp"
+#include "pulmo/run_lock.hpp"
 
 #include <cstdio>
 #include <fstream>
@@ -24,7 +25,8 @@ PetscErrorCode finish_file(MPI_Comm comm, std::ofstream &f, const std::string &f
 class Output {
 public:
   PetscErrorCode declare(Options &options);
-  /// Makes the directory; refuses one that holds a finished run, or a checkpoint, unless `-output_overwrite`.
+  /// Makes the directory and keeps other runs out of it; refuses one in which another run is at work, or that holds a
+  /// finished run, or a checkpoint, unless `-output_overwrite`.
   /// @p restart: the checkpoint that the run goes on from, if any; what lies beside it stays as far as it is named in
   /// @p kept.
   PetscErrorCode prepare(const Options &options, const std::string &restart, const std::vector<std::string> &kept);
@@ -37,9 +39,13 @@ public:
   bool error_indicator() const { return error_indicator_; }
 
 private:
+  /// Why the directory is not this run's, or empty.
+  std::string occupied(bool continues) const;
+
   std::string directory_ = "results";
   bool overwrite_ = false, progress_ = true, error_indicator_ = false;
   PetscReal fields_every_ = 0;
+  RunLock lock_; ///< of rank 0
 };
 
 /// Times a fixed interval apart; what is due comes with the first step at or after each of them.

@@ -445,6 +445,110 @@ class Signals(RestartCase):
             self.assertFalse(alive(pid), "a rank lives on")
 
 
+class Locks(RestartCase):
+    """One run at a time works in a directory."""
+
+    def lock(self, directory):
+        with open(os.path.join(directory, "pulmo.lock")) as f:
+            return dict(line.split(" ", 1) for line in f.read().splitlines())
+
+    def killed(self):
+        """The lock of a run that was killed, and its directory."""
+        run = Running(LONG, pulmo.scratch())
+        run.wait_for_rows(1)
+        run.process.kill()
+        run.end()
+        return self.lock(run.directory), run.directory
+
+    def write(self, directory, text):
+        with open(os.path.join(directory, "pulmo.lock"), "w") as f:
+            f.write(text if isinstance(text, str) else "".join(f"{k} {v}\n" for k, v in text.items()))
+
+    def test_second_run(self):
+        run = Running(LONG, pulmo.scratch())
+        run.wait_for_rows(2)
+        lock = self.lock(run.directory)
+        self.assertEqual((int(lock["process"]), lock["host"]), (run.process.pid, os.uname().nodename))
+        link = pulmo.scratch("link")
+        os.symlink(run.directory, link)
+        for ranks, directory, options in ((1, run.directory, []), (2, run.directory, ["-output_overwrite"]), (1, link, [])):
+            case = pulmo.Case(LONG + options, ranks=ranks, directory=directory)
+            self.expect_error(case.code, case.err, f"-output_dir {directory} is in use by another run (process {run.process.pid} on "
+                              f"{lock['host']}, started {lock['since']})")
+            self.assertEqual(case.code, 1)
+        self.assertEqual(self.lock(run.directory), lock)
+        run.wait_for_rows(len(rows_so_far(run.directory)) + 2) # it is not disturbed
+        run.process.send_signal(signal.SIGTERM)
+        self.assertIn("stopped by SIGTERM", run.end()[2])
+        steps = [float(row[5]) for row in rows_so_far(run.directory)]
+        np.testing.assert_allclose(np.cumsum(steps), [float(row[0]) for row in rows_so_far(run.directory)], rtol=1e-9)
+        self.assertNotIn("pulmo.lock", os.listdir(run.directory))
+
+    def test_released(self):
+        """However a run ends by itself."""
+        case = pulmo.finished(PCV + ["-ts_max_time", "0.1"])
+        self.assertEqual([f for f in case.files() if "lock" in f], [])
+        failed = pulmo.Case(PCV + ["-snes_max_it", "1"])
+        self.assertIn("failure.json", failed.files())
+        self.assertEqual([f for f in failed.files() if "lock" in f], [])
+        for sent in (["SIGHUP"], ["SIGSEGV"], ["SIGTERM", "SIGTERM"]):
+            with self.subTest(sent):
+                endless = ["-snes_rtol", "0", "-snes_atol", "0", "-snes_max_it", "100000000", "-snes_linesearch_type", "basic"]
+                run = Running(LONG + endless, pulmo.scratch())
+                run.wait_for_rows(1)
+                for name in sent:
+                    run.process.send_signal(getattr(signal, name))
+                    time.sleep(3.2 if len(sent) > 1 else 0)
+                self.assertNotEqual(run.end()[0], 0)
+                self.assertEqual([f for f in os.listdir(run.directory) if "lock" in f], [])
+
+    def test_left_behind(self):
+        lock, directory = self.killed()
+        on = ["-ts_max_time", "0.1"]
+        taken = pulmo.finished(PCV + on, directory=directory, ranks=2)
+        self.assertIn(f"was killed (process {lock['process']} on {lock['host']}, started {lock['since']})", taken.out)
+        again = ["-output_overwrite"] + on
+        for change, words in (({"host": "elsewhere"}, ["process {process} on elsewhere", "remove {lock}"]),
+                              ({"namespace": "pid:[1]"}, ["process {process} on", "remove {lock}"]), # of another container
+                              ({"boot": "2", "machine": "3"}, ["process {process} on", "remove {lock}"]), # another machine of that name
+                              ({"process": str(os.getpid()), "start": ""}, [f"process {os.getpid()} on"])):
+            self.write(directory, lock | change)
+            case = pulmo.Case(PCV + again, directory=directory)
+            known = {"process": lock["process"], "lock": os.path.join(directory, "pulmo.lock")}
+            self.expect_error(case.code, case.err, "in use by another run", *(w.format(**known) for w in words))
+            self.assertIn("summary.json", case.files(), "what is there stays")
+        for text in ("", "none of pulmo's\n"):
+            self.write(directory, text)
+            case = pulmo.Case(PCV + again, directory=directory)
+            self.expect_error(case.code, case.err, "does not say by whom", "remove " + os.path.join(directory, "pulmo.lock"))
+        # its number belongs to another process by now; the machine was started anew
+        for change in ({"process": str(os.getpid())}, {"boot": "2"} if lock["machine"] else {}):
+            self.write(directory, lock | change)
+            self.assertIn("was killed", pulmo.finished(PCV + again, directory=directory).out)
+        self.assertEqual([f for f in os.listdir(directory) if "lock" in f], [])
+
+    def test_same_instant(self):
+        """In a new directory, and in one that a killed run left."""
+        for i in range(6):
+            directory = self.killed()[1] if i % 2 else pulmo.scratch()
+            runs = [Running(LONG, directory) for _ in range(4)]
+            end = time.monotonic() + 60
+            while sum(run.process.poll() is None for run in runs) > 1 and time.monotonic() < end:
+                time.sleep(0.05)
+            time.sleep(0.2)
+            alive_ones = [run for run in runs if run.process.poll() is None]
+            self.assertEqual(len(alive_ones), 1)
+            winner, = alive_ones
+            self.assertEqual(int(self.lock(directory)["process"]), winner.process.pid)
+            for run in runs:
+                if run is not winner:
+                    code, _, err = run.end()
+                    self.expect_error(code, err, "in use by another run")
+            winner.process.send_signal(signal.SIGTERM)
+            winner.end()
+            self.assertEqual([f for f in os.listdir(directory) if "lock" in f], [])
+
+
 class Faults(RestartCase):
     def test_killed_again_and_again(self):
         """20 times kill -9 at a random moment and on from what is there: at most an interval is lost each time.
