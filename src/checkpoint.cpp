@@ -125,7 +125,7 @@ PetscErrorCode Checkpoint::observe(const StepReport &step)
   const bool end = every_ > 0 && step.phase_ends && step.row.time > step.end - 1e-9 * every_;
   if (!schedule_->due(step.row.time) && !end) PetscFunctionReturn(PETSC_SUCCESS);
   PetscCall(write(complaint));
-  PulmoUserCheck(complaint.empty(), options_.comm(), "%s", complaint.c_str());
+  PulmoFailureCheck(complaint.empty(), options_.comm(), "%s", complaint.c_str());
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

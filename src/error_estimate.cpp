@@ -313,9 +313,9 @@ PetscErrorCode ErrorEstimate::run_level(const Options &options, const Output &ou
   StopSignal signal(comm);
   simulation.heed(signal);
   PetscCall(simulation.run(finished));
-  PulmoUserCheck(!simulation.stopped(), comm,
-                 "stopped by %s while the errors were estimated; the run itself is whole in %s, without error bars",
-                 signal.name(), output.directory().c_str());
+  PulmoFailureCheck(!simulation.stopped(), comm,
+                    "stopped by %s while the errors were estimated; the run itself is whole in %s, without error bars",
+                    signal.name(), output.directory().c_str());
   PetscCall(PetscTime(&end));
   PetscCall(describe_level(simulation, run.scene(), level));
   level.seconds = end - begin;

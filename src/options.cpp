@@ -426,6 +426,8 @@ PetscErrorCode Options::print_help() const
                           d.range.empty() || d.range == "any" ? "" : (" " + d.range).c_str(),
                           d.value.empty() ? "none" : d.value.c_str()));
   }
+  PetscCall(PetscPrintf(comm_, "\nExit code: 0 finished, 1 wrong input, 2 could not go on, 3 stopped by a signal and "
+                               "there is a checkpoint to go on from (docs/running.md)\n"));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -27,7 +27,7 @@ PetscErrorCode take_name(MPI_Comm comm, bool written, const std::string &file)
     written = !error;
   }
   PetscCall(from_root(comm, written));
-  PulmoUserCheck(written, comm, "cannot write %s; free the disk or choose another -output_dir", file.c_str());
+  PulmoFailureCheck(written, comm, "cannot write %s; free the disk or choose another -output_dir", file.c_str());
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -164,8 +164,8 @@ PetscErrorCode SignalWriter::observe(const StepReport &step)
     written = file_ && std::fflush(file_) == 0 && !std::ferror(file_);
   }
   PetscCall(from_root(comm_, written));
-  PulmoUserCheck(written, comm_, "cannot write %s; free the disk or choose another -output_dir",
-                 output_.path("signals.csv.part").c_str());
+  PulmoFailureCheck(written, comm_, "cannot write %s; free the disk or choose another -output_dir",
+                    output_.path("signals.csv.part").c_str());
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

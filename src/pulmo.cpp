@@ -3,6 +3,8 @@
 #include "pulmo/checkpoint.hpp"
 
 #include <algorithm>
+#include <csignal>
+#include <cstring>
 
 namespace pulmo {
 
@@ -28,14 +30,21 @@ std::string option_error(PetscErrorCode code, const std::string &message, const 
   return option + " takes a number, not '" + word + "'";
 }
 
-/// User errors: one sentence from one rank. Everything else: PETSc's trace.
+/// Whether a code is one of pulmo's own, of an error told in a sentence.
+bool is_own(PetscErrorCode code)
+{
+  return code == PETSC_ERR_USER_INPUT || code == PULMO_ERR_COULD_NOT_GO_ON || code == PULMO_ERR_STOPPED;
+}
+
+/// pulmo's own errors: one sentence from one rank. Everything else: PETSc's trace.
 PetscErrorCode handle_error(MPI_Comm comm, int line, const char *function, const char *file, PetscErrorCode code,
                             PetscErrorType type, const char *message, void *context)
 {
   std::string text = message ? message : "";
-  if (code != PETSC_ERR_USER_INPUT) {
+  if (!is_own(code)) {
     text = type == PETSC_ERROR_INITIAL ? option_error(code, text, function ? function : "") : "";
     if (text.empty()) return PetscTraceBackErrorHandler(comm, line, function, file, code, type, message, context);
+    code = PETSC_ERR_USER_INPUT;
   }
   if (type == PETSC_ERROR_INITIAL) {
     PetscMPIInt rank = 0; // options are the same on all ranks, so all ranks are here
@@ -45,14 +54,22 @@ PetscErrorCode handle_error(MPI_Comm comm, int line, const char *function, const
       std::fprintf(stderr, "pulmo: error: %s\n", text.c_str());
     }
   }
-  return PETSC_ERR_USER_INPUT; // callers get what the handler returns
+  return code; // callers get what the handler returns
 }
 
-/// Ends a process as PETSc does, but leaves no lock.
+/// A crash, or a signal before the run heeds any: no lock is left, and the exit code is not PETSc's 59.
 PetscErrorCode handle_signal(int signal, void *)
 {
   RunLock::abandon();
-  return PetscSignalHandlerDefault(signal, nullptr);
+  if (signal == SIGTERM || signal == SIGHUP || signal == SIGQUIT)
+    (void)std::fprintf(stderr, "pulmo: error: stopped by signal %d (%s) while nothing was at hand that could be kept\n",
+                       signal, strsignal(signal));
+  else
+    (void)PetscError(PETSC_COMM_SELF, 0, nullptr, nullptr, PETSC_ERR_SIG, PETSC_ERROR_INITIAL,
+                     "pulmo crashed: signal %d (%s); please report it with the options and the mesh", signal,
+                     strsignal(signal));
+  (void)MPI_Abort(PETSC_COMM_WORLD, PULMO_COULD_NOT_GO_ON);
+  return PETSC_ERR_SIG;
 }
 
 /// Tissue stiffness that scales the equations: the largest diagonal entry of dP'/dF at F = I, kPa.
@@ -76,12 +93,13 @@ PetscErrorCode stop(Checkpoint &checkpoint, const Simulation &simulation, const 
   std::string complaint;
 
   PetscFunctionBeginUser;
-  PulmoUserCheck(simulation.rows().size() > 1, comm, "stopped by %s before the first step; nothing is lost", signal);
+  PulmoFailureCheck(simulation.rows().size() > 1, comm,
+                    "stopped by %s before the first step; nothing is lost: start the run again", signal);
   PetscCall(checkpoint.write(complaint));
-  PulmoUserCheck(complaint.empty(), comm, "stopped by %s after t = %.6g s, and %s", signal, (double)simulation.time(),
-                 complaint.c_str());
-  PulmoUserError(comm, "stopped by %s after t = %.6g s; to go on, give the same options and -restart %s", signal,
-                 (double)simulation.time(), checkpoint.path().c_str());
+  PulmoFailureCheck(complaint.empty(), comm, "stopped by %s after t = %.6g s, and %s", signal,
+                    (double)simulation.time(), complaint.c_str());
+  PulmoStopped(comm, "stopped by %s after t = %.6g s; to go on, give the same options and -restart %s", signal,
+               (double)simulation.time(), checkpoint.path().c_str());
 }
 
 /// A checkpoint of the last state of a run that failed. @p text: where it is, or why there is none.
@@ -163,9 +181,9 @@ PetscErrorCode initialize()
   PetscBool no_handler = PETSC_FALSE;
 
   PetscFunctionBeginUser;
+  PetscCall(PetscPushErrorHandler(handle_error, nullptr));
   PetscCall(PetscOptionsGetBool(nullptr, nullptr, "-no_signal_handler", &no_handler, nullptr));
   if (!no_handler) PetscCall(PetscPushSignalHandler(handle_signal, nullptr));
-  PetscCall(PetscPushErrorHandler(handle_error, nullptr));
   PetscCall(register_fe_type());
   PetscCall(register_metis_partitioner());
   PetscCall(register_p_multigrid());
@@ -290,8 +308,8 @@ PetscErrorCode run(const Registry &registry, bool &finished)
     PetscCall(keep_last_state(checkpoint, simulation, kept));
     PetscCall(fields.snapshot(simulation.time(), simulation.local_state()));
     PetscCall(write_summary(options, output, scene, run.model(), simulation, audits, false));
-    PulmoUserError(comm, "%s The last good state and the signals so far are in %s.%s",
-                   simulation.failure_text().c_str(), output.directory().c_str(), kept.c_str());
+    PulmoFailure(comm, "%s The last good state and the signals so far are in %s.%s", simulation.failure_text().c_str(),
+                 output.directory().c_str(), kept.c_str());
   }
   PetscCall(signals.finish());
   PetscCall(write_summary(options, output, scene, run.model(), simulation, audits, true));

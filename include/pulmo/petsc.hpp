@@ -20,14 +20,30 @@
 #define PETSC_SUCCESS static_cast<PetscErrorCode>(0)
 #endif
 
-/// Ends the calling function with an error that the user can fix: one sentence, no stack trace.
+/// What the program ends with (docs/running.md); the same on every rank.
+enum PulmoExitCode : int { PULMO_FINISHED = 0, PULMO_WRONG_INPUT = 1, PULMO_COULD_NOT_GO_ON = 2, PULMO_STOPPED = 3 };
+
+/// Error codes of a run that could not go on and of one that a signal stopped; PETSc's own codes end far below.
+#define PULMO_ERR_COULD_NOT_GO_ON static_cast<PetscErrorCode>(13002)
+#define PULMO_ERR_STOPPED static_cast<PetscErrorCode>(13003)
+
+/// Each ends the calling function with an error that is one sentence without a stack trace, PulmoUserError with one
+/// that is the input's fault, PulmoFailure with one that is not, PulmoStopped once there is a checkpoint to go on from.
 /// Collective: every rank of the communicator must reach it with the same message.
 #define PulmoUserError(comm, ...) SETERRQ(comm, PETSC_ERR_USER_INPUT, __VA_ARGS__)
+#define PulmoFailure(comm, ...) SETERRQ(comm, PULMO_ERR_COULD_NOT_GO_ON, __VA_ARGS__)
+#define PulmoStopped(comm, ...) SETERRQ(comm, PULMO_ERR_STOPPED, __VA_ARGS__)
 
 /// PulmoUserError unless @p condition holds.
 #define PulmoUserCheck(condition, comm, ...)                                                                           \
   do {                                                                                                                 \
     if (PetscUnlikely(!(condition))) PulmoUserError(comm, __VA_ARGS__);                                                \
+  } while (0)
+
+/// PulmoFailure unless @p condition holds.
+#define PulmoFailureCheck(condition, comm, ...)                                                                        \
+  do {                                                                                                                 \
+    if (PetscUnlikely(!(condition))) PulmoFailure(comm, __VA_ARGS__);                                                  \
   } while (0)
 
 namespace pulmo {

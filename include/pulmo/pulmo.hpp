@@ -37,7 +37,7 @@ private:
 PetscErrorCode check_held(MPI_Comm comm, const Scene &scene, const Composition &composition);
 
 /// Runs the scene of the options database and writes its output. @p finished tells whether the run reached its
-/// end; user errors come back as PETSC_ERR_USER_INPUT, already printed.
+/// end; errors that a sentence tells come back with the code of their kind, already printed.
 PetscErrorCode run(const Registry &registry, bool &finished);
 
 } // namespace pulmo

@@ -130,7 +130,7 @@ class Lab:
         """What is wrong with how a run ended; empty if it finished, or stopped as it should."""
         if "PETSC ERROR" in run.err:
             return "PETSc trace: " + next(line for line in run.err.splitlines() if "PETSC ERROR" in line)
-        if run.code is None or run.code < 0 or run.code > 1:
+        if run.code is None or run.code not in (0, 1, 2, 3):
             return f"ended with code {run.code}"
         if not run.finished and run.err.count("pulmo: error:") != 1:
             return f"code {run.code} without one sentence: {run.err[-200:]}"
