@@ -1,9 +1,10 @@
 #include "pulmo/archive.hpp"
 
+#include "pulmo/hdf5_image.hpp"
+
 #include <algorithm>
 #include <cstdio>
 #include <filesystem>
-#include <hdf5.h>
 #include <sstream>
 
 namespace pulmo {
@@ -14,65 +15,13 @@ namespace {
 constexpr const char *marker = "pulmo_checkpoint";
 constexpr int format = 2; // 2: the names of the mesh
 
-/// Entries of a dataset that have one checksum.
-constexpr hsize_t chunk_rows = 1 << 16;
-
-/// HDF5 says nothing while this lives; pulmo does.
-class Quiet {
-public:
-  Quiet()
-  {
-    H5Eget_auto2(H5E_DEFAULT, &print_, &data_);
-    H5Eset_auto2(H5E_DEFAULT, nullptr, nullptr);
-  }
-  ~Quiet() { H5Eset_auto2(H5E_DEFAULT, print_, data_); }
-  Quiet(const Quiet &) = delete;
-  Quiet &operator=(const Quiet &) = delete;
-
-private:
-  H5E_auto2_t print_ = nullptr;
-  void *data_ = nullptr;
-};
-
-/// An HDF5 handle that is closed at the end of its life.
-class Id {
-public:
-  Id(hid_t id, herr_t (*close)(hid_t)) : id_(id), close_(close) {}
-  ~Id()
-  {
-    if (id_ >= 0) close_(id_);
-  }
-  Id(const Id &) = delete;
-  Id &operator=(const Id &) = delete;
-  operator hid_t() const { return id_; }
-
-private:
-  hid_t id_;
-  herr_t (*close_)(hid_t);
-};
-
-bool write_dataset(hid_t file, const std::string &name, hid_t type, const std::vector<hsize_t> &shape, const void *data)
-{
-  const Id space(H5Screate_simple(static_cast<int>(shape.size()), shape.data(), nullptr), H5Sclose);
-  const Id making(H5Pcreate(H5P_DATASET_CREATE), H5Pclose), linking(H5Pcreate(H5P_LINK_CREATE), H5Pclose);
-  bool good = H5Pset_create_intermediate_group(linking, 1) >= 0;
-  if (std::find(shape.begin(), shape.end(), 0) == shape.end()) { // a damaged disk is found out when it is read
-    std::vector<hsize_t> chunk = shape;
-    chunk[0] = std::min(chunk[0], chunk_rows);
-    good = good && H5Pset_chunk(making, static_cast<int>(chunk.size()), chunk.data()) >= 0 &&
-           H5Pset_fletcher32(making) >= 0;
-  }
-  const Id set(H5Dcreate2(file, name.c_str(), type, space, linking, making, H5P_DEFAULT), H5Dclose);
-  return good && set >= 0 && H5Dwrite(set, type, H5S_ALL, H5S_ALL, H5P_DEFAULT, data) >= 0;
-}
-
 /// @p data is resized to what is there; @p type as in memory.
 template <class T>
 bool read_dataset(hid_t file, const std::string &name, hid_t type, std::vector<hsize_t> &shape, std::vector<T> &data)
 {
-  const Id set(H5Dopen2(file, name.c_str(), H5P_DEFAULT), H5Dclose);
+  const Hdf5Id set(H5Dopen2(file, name.c_str(), H5P_DEFAULT), H5Dclose);
   if (set < 0) return false;
-  const Id space(H5Dget_space(set), H5Sclose), stored(H5Dget_type(set), H5Tclose);
+  const Hdf5Id space(H5Dget_space(set), H5Sclose), stored(H5Dget_type(set), H5Tclose);
   const int rank = H5Sget_simple_extent_ndims(space);
   if (rank < 1 || H5Tget_class(stored) != H5Tget_class(type)) return false;
   shape.resize(static_cast<std::size_t>(rank));
@@ -82,6 +31,12 @@ bool read_dataset(hid_t file, const std::string &name, hid_t type, std::vector<h
   if (n > 0 && H5Dget_storage_size(set) < static_cast<hsize_t>(n) * H5Tget_size(stored)) return false;
   data.resize(static_cast<std::size_t>(n));
   return H5Dread(set, type, H5S_ALL, H5S_ALL, H5P_DEFAULT, data.data()) >= 0;
+}
+
+/// With checksums: a damaged disk is found out when it is read.
+bool write_dataset(hid_t file, const std::string &name, hid_t type, const std::vector<hsize_t> &shape, const void *data)
+{
+  return write_hdf5(file, name, type, shape, data, true);
 }
 
 bool write_text(hid_t file, const std::string &name, const std::string &text)
@@ -124,7 +79,7 @@ hid_t open_file(const std::string &name, std::string &complaint)
     return -1;
   }
   {
-    const Id mark(H5Aopen(file, marker, H5P_DEFAULT), H5Aclose);
+    const Hdf5Id mark(H5Aopen(file, marker, H5P_DEFAULT), H5Aclose);
     if (mark < 0)
       complaint = "this HDF5 file is no checkpoint of pulmo; give a checkpoint.h5 that pulmo wrote";
     else if (H5Aread(mark, H5T_NATIVE_INT, &found) < 0 || found != format)
@@ -150,24 +105,19 @@ Archive::Archive(const Model &model, const NodeOrder &order, bool reading)
 
 Archive::~Archive()
 {
-  const Quiet quiet;
+  const QuietHdf5 quiet;
   if (file_ >= 0) H5Fclose(file_);
 }
 
 PetscErrorCode Archive::create(const Model &model, const NodeOrder &order, std::unique_ptr<Archive> &archive)
 {
-  constexpr std::size_t growth = 1 << 20; // bytes
-
   PetscFunctionBeginUser;
   archive.reset(new Archive(model, order, false));
-  if (archive->root_) { // in memory: what can go wrong with a disk is found out in one place
-    const Id access(H5Pcreate(H5P_FILE_ACCESS), H5Pclose), space(H5Screate(H5S_SCALAR), H5Sclose);
-    bool &good = archive->good_;
-    good = H5Pset_fapl_core(access, growth, 0) >= 0;
-    archive->file_ = H5Fcreate(marker, H5F_ACC_TRUNC, H5P_DEFAULT, access);
-    good = good && archive->file_ >= 0;
-    const Id mark(H5Acreate2(archive->file_, marker, H5T_NATIVE_INT, space, H5P_DEFAULT, H5P_DEFAULT), H5Aclose);
-    good = good && mark >= 0 && H5Awrite(mark, H5T_NATIVE_INT, &format) >= 0;
+  if (archive->root_) {
+    const Hdf5Id space(H5Screate(H5S_SCALAR), H5Sclose);
+    archive->file_ = create_hdf5_image();
+    const Hdf5Id mark(H5Acreate2(archive->file_, marker, H5T_NATIVE_INT, space, H5P_DEFAULT, H5P_DEFAULT), H5Aclose);
+    archive->good_ = archive->file_ >= 0 && mark >= 0 && H5Awrite(mark, H5T_NATIVE_INT, &format) >= 0;
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -184,7 +134,7 @@ PetscErrorCode Archive::open(const Model &model, const NodeOrder &order, const s
   archive->option_ = option;
   archive->path_ = file;
   if (archive->root_) {
-    const Quiet quiet;
+    const QuietHdf5 quiet;
     archive->file_ = open_file(file, complaint);
   }
   PetscCall(from_root(archive->comm_, complaint));
@@ -212,15 +162,7 @@ PetscErrorCode Archive::finish(std::vector<char> &image)
   n = values.size();
   PetscCall(text("scalar_names", names));
   PetscCall(numbers("scalars", n, values));
-  if (root_ && good_) {
-    good_ = H5Fflush(file_, H5F_SCOPE_GLOBAL) >= 0;
-    const auto size = H5Fget_file_image(file_, nullptr, 0);
-    good_ = good_ && size > 0;
-    if (good_) {
-      image.resize(static_cast<std::size_t>(size));
-      good_ = H5Fget_file_image(file_, image.data(), image.size()) == size;
-    }
-  }
+  if (root_ && good_) good_ = take_hdf5_image(file_, image);
   PetscCall(from_root(comm_, good_));
   PetscCheck(good_, comm_, PETSC_ERR_LIB, "HDF5 failed to make a file in memory");
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -266,7 +208,7 @@ PetscErrorCode Archive::text(const std::string &name, std::string &text)
   }
   bool good = true;
   if (root_) {
-    const Quiet quiet;
+    const QuietHdf5 quiet;
     good = read_text(file_, name, text);
   }
   PetscCall(check_root(good, name));
@@ -285,7 +227,7 @@ PetscErrorCode Archive::numbers(const std::string &name, std::size_t &n, std::ve
   bool good = true;
   std::uint64_t sizes[2] = {0, 0};
   if (root_) {
-    const Quiet quiet;
+    const QuietHdf5 quiet;
     std::vector<hsize_t> shape;
     good = read_dataset(file_, name, H5T_NATIVE_DOUBLE, shape, values) && shape.size() == 2;
     if (good) {
@@ -320,7 +262,7 @@ PetscErrorCode Archive::local(const std::string &name, Vec x)
     }
     bool good = true;
     if (root_) {
-      const Quiet quiet;
+      const QuietHdf5 quiet;
       std::vector<hsize_t> shape;
       good = read_dataset(file_, dataset, H5T_NATIVE_DOUBLE, shape, values) && shape.size() == 2 && shape[1] == width;
     }

@@ -1,6 +1,7 @@
 #include "pulmo/checkpoint.hpp"
 
 #include "pulmo/named_parts.hpp"
+#include "pulmo/whole_file.hpp"
 
 #include <algorithm>
 #include <array>
@@ -32,24 +33,6 @@ bool is_free(const std::string &option)
     const std::size_t n = std::strlen(prefix);
     return option.compare(0, n, prefix) == 0 && (option.size() == n || option[n] == '_');
   });
-}
-
-/// Writes @p image to @p file and waits until it is on the disk. 0, or the error.
-int write_through(const std::string &file, const std::vector<char> &image)
-{
-  const int descriptor = open(file.c_str(), O_WRONLY | O_CREAT | O_TRUNC | O_CLOEXEC, 0666);
-  if (descriptor < 0) return errno;
-  int error = 0;
-  for (std::size_t done = 0; error == 0 && done < image.size();) {
-    const ssize_t n = ::write(descriptor, image.data() + done, image.size() - done);
-    if (n > 0)
-      done += static_cast<std::size_t>(n);
-    else if (n == 0 || errno != EINTR)
-      error = n == 0 ? EIO : errno;
-  }
-  if (error == 0 && fsync(descriptor) != 0) error = errno;
-  if (close(descriptor) != 0 && error == 0) error = errno;
-  return error;
 }
 
 /// Makes a directory's entries survive a loss of power, as far as its file system can.
@@ -147,7 +130,7 @@ PetscErrorCode Checkpoint::write(std::string &complaint)
   PetscCall(archive->finish(image));
   archive.reset();
   if (rank == 0) {
-    error = write_through(part, image);
+    error = write_image(part, image, true);
     if (error == 0) error = take_place(part, path(), output_.path("checkpoint_previous.h5"), spare_previous_);
     std::error_code ignored;
     if (error != 0) fs::remove(part, ignored);

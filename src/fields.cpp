@@ -1,12 +1,15 @@
-// Field snapshots: HDF5 through PETSc's viewer, one XDMF index with quadratic tetrahedra, whatever the elements.
+// Field snapshots: HDF5 files, one XDMF index with quadratic tetrahedra, whatever the elements.
 #include "pulmo/error_indicator.hpp"
+#include "pulmo/hdf5_image.hpp"
 #include "pulmo/node_order.hpp"
 #include "pulmo/output.hpp"
+#include "pulmo/whole_file.hpp"
 
 #include <array>
 #include <cmath>
 #include <filesystem>
 #include <fstream>
+#include <numeric>
 #include <sstream>
 
 namespace pulmo {
@@ -19,19 +22,87 @@ constexpr std::array<std::array<int, 2>, 6> edges{{{0, 1}, {1, 2}, {0, 2}, {0, 3
 /// Name of the indicators in the files; that of the flow and what they are shares of have more.
 const std::string error_indicator = "error_indicator";
 
-/// Writes a block of values as dataset @p name, @p components per entry.
-PetscErrorCode write_values(PetscViewer viewer, const char *name, PetscInt components,
-                            const std::vector<PetscScalar> &values)
+/// What all ranks have, one after the other, on rank 0.
+template <class T>
+PetscErrorCode gather(MPI_Comm comm, MPI_Datatype type, const std::vector<T> &mine, std::vector<T> &all)
 {
-  VecHandle v;
-  const MPI_Comm comm = PetscObjectComm((PetscObject)viewer);
+  PetscMPIInt rank, size, n;
 
   PetscFunctionBeginUser;
-  PetscCall(VecCreateMPIWithArray(comm, components, (PetscInt)values.size(), PETSC_DETERMINE, values.data(), v.out()));
-  PetscCall(PetscObjectSetName((PetscObject)(Vec)v, name));
-  PetscCall(VecView(v, viewer));
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  PetscCallMPI(MPI_Comm_size(comm, &size));
+  std::vector<PetscMPIInt> counts(rank == 0 ? size : 0), starts(counts.size());
+  PetscCall(PetscMPIIntCast(static_cast<PetscInt>(mine.size()), &n));
+  PetscCallMPI(MPI_Gather(&n, 1, MPI_INT, counts.data(), 1, MPI_INT, 0, comm));
+  std::exclusive_scan(counts.begin(), counts.end(), starts.begin(), 0);
+  if (rank == 0) all.resize(static_cast<std::size_t>(starts.back()) + static_cast<std::size_t>(counts.back()));
+  PetscCallMPI(MPI_Gatherv(mine.data(), n, type, all.data(), counts.data(), starts.data(), type, 0, comm));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
+
+/// A file of values of all ranks, made in the memory of rank 0 and then written whole: a disk that fails in the middle
+/// of a collective write would leave ranks waiting for each other.
+class ValueFile {
+public:
+  explicit ValueFile(MPI_Comm comm) : comm_(comm)
+  {
+    PetscMPIInt rank = 0;
+    (void)MPI_Comm_rank(comm, &rank);
+    root_ = rank == 0;
+    if (root_) file_ = create_hdf5_image();
+  }
+  ~ValueFile()
+  {
+    if (file_ >= 0) H5Fclose(file_);
+  }
+  ValueFile(const ValueFile &) = delete;
+  ValueFile &operator=(const ValueFile &) = delete;
+
+  /// A dataset of @p columns values per entry.
+  PetscErrorCode write(const std::string &name, PetscInt columns, const std::vector<PetscScalar> &values)
+  {
+    return write(name, MPIU_SCALAR, H5T_NATIVE_DOUBLE, columns, values);
+  }
+  PetscErrorCode write(const std::string &name, PetscInt columns, const std::vector<PetscInt> &values)
+  {
+    return write(name, MPIU_INT, sizeof(PetscInt) == sizeof(int) ? H5T_NATIVE_INT : H5T_NATIVE_INT64, columns, values);
+  }
+  /// Writes it all to @p path.
+  PetscErrorCode close(const std::string &path)
+  {
+    int error = 0;
+
+    PetscFunctionBeginUser;
+    if (root_) {
+      std::vector<char> image;
+      good_ = good_ && take_hdf5_image(file_, image);
+      if (good_) error = write_whole(path, image);
+    }
+    PetscCall(from_root(comm_, good_));
+    PetscCheck(good_, comm_, PETSC_ERR_LIB, "HDF5 failed to make a file in memory");
+    PetscCall(check_written(comm_, error, path));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+private:
+  template <class T>
+  PetscErrorCode write(const std::string &name, MPI_Datatype mpi_type, hid_t type, PetscInt columns,
+                       const std::vector<T> &mine)
+  {
+    std::vector<T> all;
+
+    PetscFunctionBeginUser;
+    PetscCall(gather(comm_, mpi_type, mine, all));
+    std::vector<hsize_t> shape{all.size() / static_cast<std::size_t>(columns)};
+    if (columns > 1) shape.push_back(static_cast<hsize_t>(columns));
+    if (root_) good_ = good_ && file_ >= 0 && write_hdf5(file_, name, type, shape, all.data(), false);
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+  MPI_Comm comm_;
+  bool root_ = false, good_ = true;
+  hid_t file_ = -1; ///< on rank 0
+};
 
 /// A field at a vertex or in the middle of an edge of @p dm, from a local vector; appended to @p values.
 PetscErrorCode append_at(DM dm, PetscInt point, PetscInt field, const PetscScalar *x, std::vector<PetscScalar> &values)
@@ -60,25 +131,6 @@ PetscErrorCode append_at(DM dm, PetscInt point, PetscInt field, const PetscScala
     PetscCall(PetscSectionGetFieldOffset(section, ends[i], field, &offset));
     for (PetscInt d = 0; d < components; ++d) values[first + d] += of_end * x[offset + d];
   }
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-/// Opens @p file under a temporary name; close_whole() gives it its own.
-PetscErrorCode open_part(MPI_Comm comm, const std::string &file, ViewerHandle &viewer)
-{
-  PetscFunctionBeginUser;
-  PetscCall(PetscViewerCreate(comm, viewer.out()));
-  PetscCall(PetscViewerSetType(viewer, PETSCVIEWERHDF5));
-  PetscCall(PetscViewerFileSetMode(viewer, FILE_MODE_WRITE));
-  PetscCall(PetscViewerFileSetName(viewer, (file + ".part").c_str()));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode close_whole(MPI_Comm comm, const std::string &file, ViewerHandle &viewer)
-{
-  PetscFunctionBeginUser;
-  viewer.reset();
-  PetscCall(take_name(comm, true, file));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -212,8 +264,7 @@ PetscErrorCode FieldWriter::write_mesh()
   PetscInt vertex_begin, vertex_end, cell_begin, cell_end, edge_begin, edge_end;
   std::vector<PetscScalar> geometry;
   std::vector<PetscInt> topology;
-  ViewerHandle viewer;
-  ISHandle cells;
+  ValueFile file(comm);
 
   PetscFunctionBeginUser;
   if (n_nodes_ < 0) PetscCall(number_nodes());
@@ -243,14 +294,9 @@ PetscErrorCode FieldWriter::write_mesh()
       PetscCall(DMPlexRestoreJoin(dm, 2, ends, &n_join, &join));
     }
   }
-  const std::string file = output_.path(mesh_);
-  PetscCall(open_part(comm, file, viewer));
-  PetscCall(write_values(viewer, "geometry", 3, geometry));
-  PetscCall(ISCreateGeneral(comm, (PetscInt)topology.size(), topology.data(), PETSC_COPY_VALUES, cells.out()));
-  PetscCall(ISSetBlockSize(cells, 10));
-  PetscCall(PetscObjectSetName((PetscObject)(IS)cells, "topology"));
-  PetscCall(ISView(cells, viewer));
-  PetscCall(close_whole(comm, file, viewer));
+  PetscCall(file.write("geometry", 3, geometry));
+  PetscCall(file.write("topology", 10, topology));
+  PetscCall(file.close(output_.path(mesh_)));
   mesh_written_ = true;
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -264,7 +310,6 @@ PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
   const TissueLaw &law = scene_.tissue().law();
   std::vector<PetscScalar> u, p, J, porosity, hydrostatic, von_mises;
   CellErrors errors;
-  ViewerHandle viewer;
 
   PetscFunctionBeginUser;
   if (!snapshots_.empty() && snapshots_.back().time == time) PetscFunctionReturn(PETSC_SUCCESS);
@@ -307,26 +352,26 @@ PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
     }
     PetscCall(indicator_->estimate(local, errors));
   }
-  const std::string name = snapshot_name(count_), file = output_.path(name);
-  PetscCall(open_part(comm, file, viewer));
-  PetscCall(write_values(viewer, "displacement", 3, u));
-  PetscCall(write_values(viewer, "J", 1, J));
-  PetscCall(write_values(viewer, "hydrostatic_stress", 1, hydrostatic));
-  PetscCall(write_values(viewer, "von_mises_stress", 1, von_mises));
+  const std::string name = snapshot_name(count_);
+  ValueFile file(comm);
+  PetscCall(file.write("displacement", 3, u));
+  PetscCall(file.write("J", 1, J));
+  PetscCall(file.write("hydrostatic_stress", 1, hydrostatic));
+  PetscCall(file.write("von_mises_stress", 1, von_mises));
   if (gas) {
-    PetscCall(write_values(viewer, "pressure", 1, p));
-    PetscCall(write_values(viewer, "porosity", 1, porosity));
+    PetscCall(file.write("pressure", 1, p));
+    PetscCall(file.write("porosity", 1, porosity));
   }
   if (output_.error_indicator()) {
     PetscMPIInt rank;
     std::vector<PetscScalar> whole;
     PetscCallMPI(MPI_Comm_rank(comm, &rank));
     if (rank == 0) whole = {errors.stress, errors.dissipation};
-    PetscCall(write_values(viewer, error_indicator.c_str(), 1, errors.tissue));
-    if (gas) PetscCall(write_values(viewer, (error_indicator + "_flux").c_str(), 1, errors.flow));
-    PetscCall(write_values(viewer, (error_indicator + "_whole").c_str(), 1, whole));
+    PetscCall(file.write(error_indicator, 1, errors.tissue));
+    if (gas) PetscCall(file.write(error_indicator + "_flux", 1, errors.flow));
+    PetscCall(file.write(error_indicator + "_whole", 1, whole));
   }
-  PetscCall(close_whole(comm, file, viewer));
+  PetscCall(file.close(output_.path(name)));
   ++count_;
   snapshots_.push_back({time, name, mesh_, output_.error_indicator()});
   PetscCall(write_index());
@@ -338,12 +383,11 @@ PetscErrorCode FieldWriter::write_index() const
   const MPI_Comm comm = PetscObjectComm((PetscObject)model_.dm());
   const std::string file = output_.path("fields.xdmf");
   PetscMPIInt rank;
-  std::ofstream f;
+  std::ostringstream f;
 
   PetscFunctionBeginUser;
   PetscCallMPI(MPI_Comm_rank(comm, &rank));
   if (rank == 0) {
-    f.open(file + ".part");
     const auto item = [&](const char *h5, const char *dataset, PetscInt rows, PetscInt columns, const char *type) {
       f << "<DataItem Format=\"HDF\" NumberType=\"" << type << "\" Precision=\""
         << (type[0] == 'I' ? sizeof(PetscInt) : 8) << "\" Dimensions=\"" << rows;
@@ -381,7 +425,7 @@ PetscErrorCode FieldWriter::write_index() const
     }
     f << "</Grid>\n</Domain>\n</Xdmf>\n";
   }
-  PetscCall(finish_file(comm, f, file));
+  PetscCall(write_text(comm, f.str(), file));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -1,10 +1,14 @@
 #include "pulmo/output.hpp"
 
 #include "pulmo/units.hpp"
+#include "pulmo/whole_file.hpp"
 
 #include <algorithm>
+#include <cerrno>
 #include <cmath>
+#include <cstring>
 #include <filesystem>
+#include <sys/stat.h>
 #include <system_error>
 
 namespace pulmo {
@@ -13,29 +17,41 @@ namespace {
 
 namespace fs = std::filesystem;
 
+/// Whether an open file still has the name @p path.
+bool is_at(std::FILE *file, const std::string &path)
+{
+  struct stat opened {
+  }, named{};
+  return fstat(fileno(file), &opened) == 0 && stat(path.c_str(), &named) == 0 && opened.st_ino == named.st_ino &&
+         opened.st_dev == named.st_dev;
+}
+
 } // namespace
 
-PetscErrorCode take_name(MPI_Comm comm, bool written, const std::string &file)
+PetscErrorCode check_written(MPI_Comm comm, int error, const std::string &file)
 {
-  PetscMPIInt rank;
-
   PetscFunctionBeginUser;
-  PetscCallMPI(MPI_Comm_rank(comm, &rank));
-  if (rank == 0 && written) {
-    std::error_code error;
-    fs::rename(file + ".part", file, error);
-    written = !error;
-  }
-  PetscCall(from_root(comm, written));
-  PulmoFailureCheck(written, comm, "cannot write %s; free the disk or choose another -output_dir", file.c_str());
+  PetscCallMPI(MPI_Bcast(&error, 1, MPI_INT, 0, comm));
+  PulmoFailureCheck(
+      error != ENOENT, comm,
+      "cannot write %s: it or its directory was removed while the run was at work; begin again, or go on from a "
+      "checkpoint, in another -output_dir",
+      file.c_str());
+  PulmoFailureCheck(error == 0, comm,
+                    "cannot write %s (%s): free the disk or choose another -output_dir; files written before are whole",
+                    file.c_str(), std::strerror(error));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode finish_file(MPI_Comm comm, std::ofstream &f, const std::string &file)
+PetscErrorCode write_text(MPI_Comm comm, const std::string &text, const std::string &file)
 {
+  PetscMPIInt rank;
+  int error = 0;
+
   PetscFunctionBeginUser;
-  f.close(); // not open on other ranks
-  PetscCall(take_name(comm, f.good(), file));
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  if (rank == 0) error = write_whole(file, {text.begin(), text.end()});
+  PetscCall(check_written(comm, error, file));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -134,8 +150,9 @@ SignalWriter::~SignalWriter()
 
 PetscErrorCode SignalWriter::observe(const StepReport &step)
 {
+  const std::string part = output_.path("signals.csv.part");
   PetscMPIInt rank;
-  bool written = true;
+  int error = 0;
 
   PetscFunctionBeginUser;
   PetscCallMPI(MPI_Comm_rank(comm_, &rank));
@@ -144,7 +161,8 @@ PetscErrorCode SignalWriter::observe(const StepReport &step)
     std::size_t first = step.rows.size() - 1;
     if (!file_) {
       first = 0; // a restarted run has earlier rows
-      file_ = std::fopen(output_.path("signals.csv.part").c_str(), "w");
+      file_ = std::fopen(part.c_str(), "w");
+      if (!file_) error = errno;
       if (file_)
         std::fprintf(file_, "time_s,%s%svolume_ml,%sdt_s,newton_iterations,krylov_iterations,min_J,max_J%s\n",
                      ventilator ? "airway_pressure_cmH2O," : "", flow ? "flow_ml_per_s," : "",
@@ -161,28 +179,29 @@ PetscErrorCode SignalWriter::observe(const StepReport &step)
       if (facts_.tube) std::fprintf(file_, ",%.15g", r.machine_pressure());
       std::fprintf(file_, "\n");
     }
-    written = file_ && std::fflush(file_) == 0 && !std::ferror(file_);
+    if (file_ && (std::fflush(file_) != 0 || std::ferror(file_))) error = errno > 0 ? errno : EIO;
+    if (file_ && error == 0 && !is_at(file_, part)) error = ENOENT; // what has no name can be written, too
   }
-  PetscCall(from_root(comm_, written));
-  PulmoFailureCheck(written, comm_, "cannot write %s; free the disk or choose another -output_dir",
-                    output_.path("signals.csv.part").c_str());
+  PetscCall(check_written(comm_, error, part));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
 PetscErrorCode SignalWriter::finish()
 {
+  const std::string file = output_.path("signals.csv");
   PetscMPIInt rank;
-  bool open = file_ != nullptr, written = true;
+  bool open = file_ != nullptr;
+  int error = 0;
 
   PetscFunctionBeginUser;
   PetscCallMPI(MPI_Comm_rank(comm_, &rank));
   PetscCall(from_root(comm_, open));
   if (!open) PetscFunctionReturn(PETSC_SUCCESS);
   if (rank == 0) {
-    written = std::fclose(file_) == 0;
+    if (std::fclose(file_) != 0 || std::rename((file + ".part").c_str(), file.c_str()) != 0) error = errno;
     file_ = nullptr;
   }
-  PetscCall(take_name(comm_, written, output_.path("signals.csv")));
+  PetscCall(check_written(comm_, error, file));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -184,6 +184,7 @@ PetscErrorCode initialize()
   PetscCall(PetscPushErrorHandler(handle_error, nullptr));
   PetscCall(PetscOptionsGetBool(nullptr, nullptr, "-no_signal_handler", &no_handler, nullptr));
   if (!no_handler) PetscCall(PetscPushSignalHandler(handle_signal, nullptr));
+  (void)std::signal(SIGXFSZ, SIG_IGN); // a file that may not grow any more: the write fails, and is told
   PetscCall(register_fe_type());
   PetscCall(register_metis_partitioner());
   PetscCall(register_p_multigrid());

@@ -101,7 +101,7 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
   PetscMPIInt rank, size;
   PetscInt dofs;
   OptionList used;
-  std::ofstream f;
+  std::ostringstream f;
 
   PetscFunctionBeginUser;
   PetscCallMPI(MPI_Comm_rank(comm, &rank));
@@ -179,10 +179,9 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
     for (const auto &[name, value] : used) list[name] = value;
     json["options"] = list;
 
-    f.open(file + ".part");
     f << json.dump(2, ' ', false, Json::error_handler_t::replace) << "\n";
   }
-  PetscCall(finish_file(comm, f, file));
+  PetscCall(write_text(comm, f.str(), file));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -190,12 +189,11 @@ PetscErrorCode write_energy(MPI_Comm comm, const Output &output, const Simulatio
 {
   const std::string file = output.path("energy.csv");
   PetscMPIInt rank;
-  std::ofstream f;
+  std::ostringstream f;
 
   PetscFunctionBeginUser;
   PetscCallMPI(MPI_Comm_rank(comm, &rank));
   if (rank == 0) {
-    f.open(file + ".part");
     f.precision(15);
     f << "time_s,ventilator_work_j";
     for (const EnergyAccount &a : audit.accounts()) f << "," << a.name << "_j";
@@ -207,7 +205,7 @@ PetscErrorCode write_energy(MPI_Comm comm, const Output &output, const Simulatio
       f << "," << b.residual << "\n";
     }
   }
-  PetscCall(finish_file(comm, f, file));
+  PetscCall(write_text(comm, f.str(), file));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -8,18 +8,16 @@
 #include "pulmo/run_lock.hpp"
 
 #include <cstdio>
-#include <fstream>
 #include <memory>
 
 namespace pulmo {
 
 class ErrorIndicator;
 
-/// Gives @p file, which was written under its name and ".part", its own name; a user error on all ranks if that or the
-/// writing (rank 0's @p written) failed.
-PetscErrorCode take_name(MPI_Comm comm, bool written, const std::string &file);
-/// The same for what rank 0 wrote through @p f.
-PetscErrorCode finish_file(MPI_Comm comm, std::ofstream &f, const std::string &file);
+/// Ends the run, on all ranks, unless rank 0's @p error (errno) of writing @p file is 0.
+PetscErrorCode check_written(MPI_Comm comm, int error, const std::string &file);
+/// Writes rank 0's @p text to @p file, whole.
+PetscErrorCode write_text(MPI_Comm comm, const std::string &text, const std::string &file);
 
 /// The run's directory and the options `-output_*`, `-progress`.
 class Output {

@@ -137,7 +137,6 @@ using SectionHandle = Handle<PetscSection, PetscSectionDestroy>;
 using SFHandle = Handle<PetscSF, PetscSFDestroy>;
 using TSHandle = Handle<TS, TSDestroy>;
 using VecHandle = Handle<Vec, VecDestroy>;
-using ViewerHandle = Handle<PetscViewer, PetscViewerDestroy>;
 
 /// Makes what rank 0 knows known to all ranks.
 inline PetscErrorCode from_root(MPI_Comm comm, bool &value)

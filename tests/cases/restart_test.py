@@ -69,8 +69,7 @@ class Running:
 
         self.directory = directory
         self.process = subprocess.Popen(command, cwd=pulmo.SOURCE, env=pulmo.ENVIRONMENT, text=True,
-                                        stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
-                                        preexec_fn=lambda: signal.signal(signal.SIGXFSZ, signal.SIG_IGN))
+                                        stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)
 
     def wait_for_rows(self, n, timeout=120):
         end = time.monotonic() + timeout
@@ -615,6 +614,56 @@ class Faults(RestartCase):
                           ends_with=2)
         self.assertEqual(self.contents(case.directory), before)
         self.assertNotIn("checkpoint.h5.part", case.files())
+
+    def test_full_disk_at_a_snapshot(self):
+        """By a limit, and on a disk that is full, where a test may mount one: no half snapshot, no trace of HDF5."""
+        limit = 5 * 1024 # more than the signals have by then, less than a snapshot
+        for ranks in (1, 2):
+            run = Running(LONG + ["-output_fields_every", "0.5"], pulmo.scratch(), ranks)
+            run.wait_for_rows(2)
+            for pid in run.workers():
+                resource.prlimit(pid, resource.RLIMIT_FSIZE, (limit, limit))
+            self.expect_unwritten(run, "fields_00001.h5", "(File too large)", "free the disk")
+        disk = pulmo.scratch("disk")
+        os.makedirs(disk)
+        if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", disk], capture_output=True).returncode != 0:
+            self.skipTest("nothing can be mounted here")
+        try:
+            run = Running(LONG + ["-output_fields_every", "0.05"], os.path.join(disk, "run"), ranks=2)
+            self.expect_unwritten(run, "fields", "(No space left on device)", "free the disk")
+            with open(os.path.join(run.directory, "fields.xdmf")) as f:
+                named = set(re.findall(r">(fields[^:]*\.h5):", f.read()))
+            self.assertGreater(len(named), 2)
+            for name in named:
+                with h5py.File(os.path.join(run.directory, name)) as f:
+                    self.assertTrue(all(np.isfinite(f[key][()]).all() for key in f), name)
+        finally:
+            subprocess.run(["umount", disk], check=True)
+
+    def expect_unwritten(self, run, name, *words):
+        code, _, err = run.end()
+        self.expect_error(code, err, "cannot write " + os.path.join(run.directory, name), *words, ends_with=2)
+        self.assertLess(len(err.split("---")[0].splitlines()), 3, "mpiexec's words aside")
+        files = os.listdir(run.directory) if os.path.isdir(run.directory) else []
+        self.assertEqual([f for f in files if f.endswith(".part") and f != "signals.csv.part"], [])
+        for left in ("summary.json", "signals.csv", "pulmo.lock"):
+            self.assertNotIn(left, files)
+
+    def test_vanished_directory(self):
+        """The directory is removed while the run is at work; another run takes its place."""
+        for ranks in (1, 2):
+            run = Running(LONG, pulmo.scratch(), ranks)
+            run.wait_for_rows(2)
+            shutil.rmtree(run.directory)
+            self.expect_unwritten(run, "", "was removed while the run was at work", "-output_dir")
+            self.assertFalse(os.path.exists(run.directory))
+        run = Running(LONG + ["-output_fields_every", "100"], pulmo.scratch())
+        run.wait_for_rows(2)
+        os.rename(run.directory, run.directory + "_moved")
+        pulmo.finished(PCV + ["-ts_max_time", "0.1"], directory=run.directory)
+        code, _, err = run.end()
+        self.expect_error(code, err, "was removed while the run was at work", ends_with=2)
+        self.assertIn("summary.json", os.listdir(run.directory), "the other run's files stay")
 
     def test_unwritable(self):
         case, before = self.started()
