@@ -23,6 +23,7 @@ FIGURES = [f"figure{n}" for n in range(3, 10)]
 def load_tool():
     """The script as a module (it has no .py ending)."""
     sys.dont_write_bytecode = True
+    sys.path.insert(0, os.path.dirname(TOOL))  # as when it is called
     loader = importlib.machinery.SourceFileLoader("reproduce_paper", TOOL)
     module = importlib.util.module_from_spec(importlib.util.spec_from_loader("reproduce_paper", loader))
     sys.modules["reproduce_paper"] = module

@@ -13,7 +13,7 @@ import numpy as np
 import pulmo_case as pulmo
 
 sys.path.insert(0, os.path.join(pulmo.SOURCE, "tools"))
-from benchmarks import assembly, common, memory, operations, scaling  # noqa: E402
+from benchmarks import assembly, common, keys, memory, operations, scaling  # noqa: E402
 from hardcases import gallery, page  # noqa: E402
 
 
@@ -134,6 +134,97 @@ class Tools(unittest.TestCase):
         self.assertEqual(repeated[:2], rows)
         self.assertEqual(repeated[2]["outcome"], "failed")
         self.assertIn("nonsense", repeated[2]["remark"])
+
+    def test_keys_cover_all_that_a_run_reads(self):
+        """A key changes with each file, however deep it is named, and with what PETSc, MPI and BLAS listen to; not with the rest."""
+        folder = pathlib.Path(pulmo.scratch())
+        folder.mkdir()
+        files = {"scene.opts": f'-options_file "{folder}/inner.opts"\n-progress off\n',
+                 "inner.opts": f"# more\n-options_file_yaml {folder}/deep.yaml\n-ventilator_programme {folder}/breath.txt\n",
+                 "deep.yaml": f"dm_plex_filename: {folder}/lung.msh\ntissue_porosity: {folder}/field.h5:porosity\n",
+                 "breath.txt": "in 1 pressure 5\n", "lung.msh": "cells\n", "field.h5": "values\n", "asked.txt": "by PETSC_OPTIONS\n",
+                 ".petscrc": f"-options_file {folder}/more.opts\n", "more.opts": "-snes_rtol 1e-3\n", "program": "#!/bin/sh\n",
+                 "unasked.txt": ""}
+        for name, text in files.items():
+            (folder / name).write_text(text)
+        (folder / "program").chmod(0o755)
+        command = [folder / "program", "-options_file", folder / "scene.opts", "-output_dir"]
+        environment = {"PATH": os.environ["PATH"], "HOME": "/nowhere", "PETSC_OPTIONS": f"-x {folder}/asked.txt", "LANG": "C"}
+
+        def key(**more):
+            here = os.getcwd()
+            os.chdir(folder)
+            try:
+                return keys.digest(command, {**environment, **more})
+            finally:
+                os.chdir(here)
+
+        first = key()
+        self.assertEqual(key(LANG="de"), first)
+        for name, text in files.items():
+            with self.subTest(name):
+                (folder / name).write_text(text + " ")
+                self.assertEqual(key() == first, name == "unasked.txt")
+                (folder / name).write_text(text)
+                self.assertEqual(key(), first)
+        for name in ("OMPI_MCA_btl", "OPENBLAS_CORETYPE", "PETSC_OPTIONS", "LD_LIBRARY_PATH"):
+            self.assertNotEqual(key(**{name: "1"}), first, name)
+        self.assertNotEqual(keys.digest([*command[:-1], "-tissue", "ma", command[-1]], environment), key())
+        self.assertGreater(len(keys.libraries(pulmo.PROGRAM)), 3)
+        (folder / "inner.opts").write_text(f"-options_file {folder}/scene.opts\n")  # a circle ends
+        self.assertNotEqual(key(), first)
+
+    def test_benchmark_sees_what_option_files_name(self):
+        """An edited programme, named by a file that a scene names, is a new run; so is another PETSC_OPTIONS. Unchanged it is kept."""
+        folder = pathlib.Path(pulmo.scratch())
+        folder.mkdir()
+        (folder / "breath.txt").write_text("inspiration 0.1 pressure 4\n")
+        (folder / "inner.opts").write_text(f"-ventilator programme\n-ventilator_programme {folder}/breath.txt\n")
+        (folder / "scene.opts").write_text(f"-options_file {folder}/inner.opts\n-tissue birzle\n-airflow\n-chest_wall\n-dm_plex_filename "
+                                           f"{pulmo.mesh('cube_lung.msh')}\n-mesh_scale 1\n")
+        few = ["strategies", folder / "scene.opts", "--output", folder / "out", "--", "@direct"]
+
+        def volume(kept, **environment):
+            command = [os.path.join(pulmo.SOURCE, "tools/benchmark"), "--build", os.path.dirname(pulmo.PROGRAM), *map(str, few)]
+            run = subprocess.run(command, env={**pulmo.ENVIRONMENT, **environment}, capture_output=True, text=True, timeout=300)
+            self.assertEqual(run.returncode, 0, run.stdout + run.stderr)
+            self.assertEqual("kept" in run.stdout, kept, run.stdout)
+            newest = max((folder / "out/runs").glob("*/run/summary.json"), key=os.path.getmtime)
+            return json.loads(newest.read_text())["tidal_volume_ml"]
+
+        first = volume(False)
+        volume(True)
+        (folder / "breath.txt").write_text("inspiration 0.1 pressure 8\n")
+        self.assertGreater(volume(False), 1.5 * first)
+        volume(True)
+        volume(False, PETSC_OPTIONS="-ts_dt 0.02")
+
+    def test_meshes_are_made_anew_by_another_tool(self):
+        """What tools/sphere_mesh made is kept until the words, the file or the tool change."""
+        path = pathlib.Path(pulmo.scratch("sphere.msh"))
+        words = ["--divisions", 1, "--layers", 1]
+        self.assertEqual([keys.make_mesh(path, "sphere_mesh", words) for _ in range(2)], [True, False])
+        self.assertTrue(keys.make_mesh(path, "sphere_mesh", ["--divisions", 2, "--layers", 1]))
+        path.write_text("spoilt")
+        self.assertTrue(keys.make_mesh(path, "sphere_mesh", words))
+        self.assertEqual([f for f in os.listdir(path.parent) if f.startswith("part")], [])
+
+    def test_tools_lock_their_folders(self):
+        """Two calls in one folder: the second ends and names the first."""
+        folder = pulmo.scratch()
+        keys.lock(folder)
+        keys.lock(folder)  # the same call may, again
+        scene = ["pcv", "--meshes", pulmo.mesh("cube_coarse.msh"), pulmo.mesh("cube.msh"), "--budget", "1s"]
+        for refused in (benchmark("strategies", "pcv", "--mesh", pulmo.mesh("cube_lung.msh"), "--output", folder, "--", "@direct"),
+                        benchmark("memory", "--mesh", pulmo.mesh("cube_lung.msh"), "--output", pulmo.scratch(), "--results", folder),
+                        tool("accuracy_cost", *scene, "--build", os.path.dirname(pulmo.PROGRAM), "--output", folder),
+                        tool("accuracy_cost", *scene, "--build", os.path.dirname(pulmo.PROGRAM), "--output", pulmo.scratch(),
+                             "--results", folder)):
+            self.assertEqual(refused.returncode, 1, refused.stderr)
+            self.assertIn(f"another call is at work in {os.path.realpath(folder)} (", refused.stderr)
+            self.assertIn(f"process {os.getpid()} on ", refused.stderr)
+            self.assertNotIn("Traceback", refused.stderr)
+        self.assertEqual(os.listdir(folder), [".lock"])
 
     def test_benchmark_counts_krylov_iterations(self):
         """The counts of the table are those of the program's own summary and signals."""

@@ -8,11 +8,11 @@ Scenes and their truth:
 """
 import json
 import statistics
-import subprocess
 from pathlib import Path
 
 from benchmarks import runs
 from benchmarks.common import SCENES, SOLVERS, SOURCE, environment, fail, markdown, require, write_csv
+from benchmarks.keys import printed
 
 from . import truth
 from .numbers import short
@@ -99,11 +99,10 @@ def manufactured(study):
         kept, program = study.folder / f"manufactured_{mesh}.txt", study.build / "tests/verification/verification_manufactured_breath"
         if not program.exists():
             fail(f"{program} is not there; build the tests first")
-        if not kept.exists() or kept.stat().st_mtime < program.stat().st_mtime:
-            text = subprocess.run([program], cwd=SOURCE, check=True, capture_output=True, text=True,
-                                  env=dict(environment(), PULMO_MANUFACTURED_MESH=mesh)).stdout
-            kept.write_text(text)
-        for line in kept.read_text().splitlines():
+        text = printed([program], kept, dict(environment(), PULMO_MANUFACTURED_MESH=mesh), [SOURCE / f"meshes/{mesh}.msh"])
+        if text is None:
+            fail(f"{program} fails; run it alone to see why")
+        for line in text.splitlines():
             if line.startswith("row "):
                 row = json.loads(line[4:])
                 if row["number"] in NUMBERS:

@@ -9,7 +9,8 @@ alone and then jointly, cheapest first, until the budget is used or the question
 README.md (answers, reference, all runs, pictures), accuracy.csv, and for each tolerance that is met an option file
 recommended_<p>percent.opts of the cheapest setting. Options of pulmo follow after --, but not those that the ladders set
 (-dm_refine, -step_volume_tolerance, -step_pressure_tolerance) nor -error_estimate, -restart, -output_dir. A finished run with
-the same command, program and files is not repeated; its time counts for the budget all the same.
+the same command, program, environment and files (also those that option files name) is not repeated; its time counts for the budget
+all the same. One call at a time works in --output and --results.
 
 Meshes: --meshes FILE ... (one body, coarse to fine), or --refine N (each mesh cut N times, nested), or the built-in pair of
 lungs at the sizes of --lung (the default if neither the scene nor the options after -- name a mesh).
@@ -21,6 +22,7 @@ import sys
 from pathlib import Path
 
 from benchmarks.common import SOURCE, fail, require
+from benchmarks.keys import lock
 from benchmarks.strategies import scene_file
 
 from . import page, settings
@@ -113,6 +115,8 @@ def prepare(words, origins=None):
     scene = [word for name in options.scene for word in ("-options_file", str(scene_file(name)))]
     settings.refuse_ours([*scene, *options.flags], options.elements)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("tools/accuracy_cost: ended; finished runs are kept"))
+    for folder in (options.output, options.results):
+        lock(folder)
     found, spent = axes(options, scene)
     named = list(options.asked) or [ALIASES.get(name, name) for name in options.numbers or []]
     ladder = Ladder(found, scene, options.flags, options, spent)

@@ -1,7 +1,7 @@
 """Convergence of every clinical number in dt and in h for the five tissue laws, on the built-in right lung."""
-import subprocess
 
-from benchmarks.common import SOURCE, markdown, write_csv
+from benchmarks.common import markdown, write_csv
+from benchmarks.keys import make_mesh
 from benchmarks.plots import plt, save
 
 from . import command, page
@@ -20,13 +20,10 @@ SHOWN = (0.1, 0.025)  # s, steps of the table
 
 def meshes(folder, sizes):
     """Meshes of the right lung of 1350 ml, coarse to fine."""
-    folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for size, airway in sizes.items():
         path = folder / f"right_{size:g}.msh"
-        if not path.exists():
-            subprocess.run([SOURCE / "tools/lung_mesh", "--side", "right", "--volume", "1350", "--bronchus-radius", "7", "--size", str(size),
-                            "--airway-size", str(airway), "--output", path], check=True, stdout=subprocess.DEVNULL)
+        make_mesh(path, "lung_mesh", ["--side", "right", "--volume", "1350", "--bronchus-radius", "7", "--size", size, "--airway-size", airway])
         paths.append(path)
     return paths
 

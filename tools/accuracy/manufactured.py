@@ -4,10 +4,10 @@ The norm of a known error is a number of the solution whose limit is 0: the tool
 uncertainty, from the errors at finite sizes alone.
 """
 import re
-import subprocess
 from pathlib import Path
 
-from benchmarks.common import environment, fail, markdown, write_csv
+from benchmarks.common import SOURCE, fail, markdown, write_csv
+from benchmarks.keys import printed
 from benchmarks.plots import plt, save
 
 from .extrapolate import limit
@@ -28,13 +28,10 @@ def output(build, results):
     program, kept = build / "tests/verification/verification_mms", results / "mms.txt"
     if not program.exists():
         fail(f"{program} is not there; build the tests first: cmake --build {build} --target verification_mms")
-    if not kept.exists() or kept.stat().st_mtime < program.stat().st_mtime:
-        run = subprocess.run([program, "--gtest_filter=ManufacturedRun*:*ManufacturedElements*"], env=environment(), capture_output=True, text=True)
-        if run.returncode:
-            fail("verification_mms fails; run it alone to see why")
-        results.mkdir(parents=True, exist_ok=True)
-        kept.write_text(run.stdout)
-    return kept.read_text()
+    text = printed([program, "--gtest_filter=ManufacturedRun*:*ManufacturedElements*"], kept, reads=sorted((SOURCE / "meshes").glob("*.msh")))
+    if text is None:
+        fail("verification_mms fails; run it alone to see why")
+    return text
 
 
 def read(text):

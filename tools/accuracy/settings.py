@@ -6,14 +6,14 @@ import math
 import re
 import resource
 import shlex
-import subprocess
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
 import meshio
 
-from benchmarks.common import SOLVERS, SOURCE, fail
+from benchmarks.common import SOLVERS, fail
+from benchmarks.keys import make_mesh
 
 from .numbers import percent
 
@@ -129,23 +129,19 @@ def cells_of(path):
         return sum(len(block.data) for block in meshio.read(path).cells if block.type == "tetra")
 
 
-def lung_words(size, path):
-    """Words that make a pair of built-in lungs of a size (mm)."""
-    return ["tools/lung_mesh", "--side", "both", "--size", f"{size:g}", "--airway-size", f"{size / AIRWAY:g}", "--output", str(path)]
+def lung_words(size):
+    """Words for tools/lung_mesh that make a pair of built-in lungs of a size (mm)."""
+    return ["--side", "both", "--size", f"{size:g}", "--airway-size", f"{size / AIRWAY:g}"]
 
 
 def lung(size, folder, clock):
-    """A pair of built-in lungs of a size (mm), made by tools/lung_mesh unless it is there; and the seconds that took."""
+    """A pair of built-in lungs of a size (mm), made by tools/lung_mesh; and the seconds that took."""
     path = folder / f"pair_{size:g}.msh"
     seconds = folder / f"pair_{size:g}.json"
     if not seconds.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        print(f"making {path.name} ...", flush=True)
-        begin, before = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
-        tool, *words = lung_words(size, path)
-        made = subprocess.run([SOURCE / tool, *words], capture_output=True, text=True)
-        if made.returncode:
-            fail(made.stderr.strip().splitlines()[-1])
+        path.unlink(missing_ok=True)
+    begin, before = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
+    if make_mesh(path, "lung_mesh", lung_words(size)):
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         seconds.write_text(json.dumps({"wall": time.monotonic() - begin,
                                        "cpu": after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime}) + "\n")
@@ -160,7 +156,7 @@ def meshes(options, scene):
         sizes = sorted(options.lung or [30, 21, 15], reverse=True)
         made = [lung(size, options.results / "meshes", options.clock) for size in sizes]
         given, seconds = [path for path, _ in made], sum(s for _, s in made)
-        origins = {path: shlex.join(lung_words(size, path)) for size, path in zip(sizes, given)}
+        origins = {path: shlex.join(["tools/lung_mesh", *lung_words(size), "--output", str(path)]) for size, path in zip(sizes, given)}
     ladder = []
     for path in given or [Path(own)]:
         if not path.is_file():

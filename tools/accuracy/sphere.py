@@ -1,10 +1,10 @@
 """The hollow sphere: errors that are known, because a radial solver gives the solution, beside those that the tool estimates."""
 import math
 import shlex
-import subprocess
 
 from benchmarks import runs
-from benchmarks.common import SOURCE, markdown, write_csv
+from benchmarks.common import markdown, write_csv
+from benchmarks.keys import make_mesh
 from benchmarks.plots import plt, save
 
 from . import command, truth
@@ -22,13 +22,11 @@ UNSCALED = {"time_constant_s"}
 
 
 def octant(folder, divisions):
-    """An octant's mesh, made by tools/sphere_mesh unless it is there: its path and the command that makes it."""
+    """An octant's mesh, made by tools/sphere_mesh: its path and the command that makes it."""
     path = folder / f"octant_{divisions}.msh"
-    tool, *words = ["tools/sphere_mesh", "--divisions", str(divisions), "--layers", str(3 * divisions), "--octant", "--output", str(path)]
-    if not path.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        subprocess.run([SOURCE / tool, *words], check=True, stdout=subprocess.DEVNULL)
-    return path, shlex.join([tool, *words])
+    words = ["--divisions", str(divisions), "--layers", str(3 * divisions), "--octant"]
+    make_mesh(path, "sphere_mesh", words)
+    return path, shlex.join(["tools/sphere_mesh", *words, "--output", str(path)])
 
 
 def exact(key, numbers):

@@ -12,7 +12,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from . import operations
-from .common import SCENES, SOLVERS, SOURCE, environment, fail, make_lung, markdown, processor, show, write_csv, write_table
+from .common import SCENES, SOLVERS, SOURCE, environment, fail, markdown, processor, show, write_csv, write_table
+from .keys import make_lung
 
 LAWS = ["berger", "ma", "birzle", "yoshihara", "rausch"]
 COUNTED = SOURCE / "meshes/lung_test.msh"

@@ -49,16 +49,6 @@ def require(build, meshes):
             fail(f"there is no mesh {mesh}")
 
 
-def make_lung(cells, build):
-    """Path of a pair of lungs of about `cells` tetrahedra, made by tools/lung_mesh if it is not there yet."""
-    mesh = build / f"lung_pair_{cells}.msh"
-    if not mesh.exists():
-        print(f"making {mesh.name} ...", flush=True)
-        subprocess.run([SOURCE / "tools/lung_mesh", "--side", "both", "--cells", str(cells), "--output", mesh],
-                       check=True, stdout=subprocess.DEVNULL)
-    return mesh
-
-
 def markdown(header, rows):
     """Lines of a table in Markdown."""
     texts = [[str(v).replace("|", "/") for v in row] for row in [header, ["---"] * len(header), *rows]]

@@ -5,6 +5,7 @@ time, meshes, option files and all that those name, to any depth, ~/.petscrc and
 listen to. What changes any of them makes a new run.
 """
 import fcntl
+import functools
 import hashlib
 import os
 import re
@@ -39,18 +40,21 @@ def is_option_file(before, word):
     return before in OPTION_FILES or Path(word).suffix in (".opts", ".yaml", ".yml") or Path(word).name in (".petscrc", "petscrc")
 
 
-def files_of(words, found=None):
-    """All files that words name, and those that the option files among them name, in the order in which they are met."""
+def files_of(words, directory, found=None):
+    """All files that words name, seen from a directory, and those that the option files among them name, in the order in which they
+    are met."""
     found = {} if found is None else found
     for before, word in zip([None, *words], words):
-        if not word or not os.path.isfile(word) or os.path.realpath(word) in found:
+        path = os.path.realpath(os.path.join(directory, word))
+        if path in found or not os.path.isfile(path):
             continue
-        found[os.path.realpath(word)] = None
+        found[path] = None
         if is_option_file(before, word):
-            files_of(words_of(Path(word).read_text(errors="replace")), found)
+            files_of(words_of(Path(path).read_text(errors="replace")), directory, found)
     return list(found)
 
 
+@functools.cache
 def libraries(program):
     """Shared libraries of a program, with size and time; none of a script."""
     with open(program, "rb") as f:
@@ -61,8 +65,9 @@ def libraries(program):
     return [f"{path} {os.stat(path).st_size} {os.stat(path).st_mtime_ns}" for path in paths if os.path.isfile(path)]
 
 
-def digest(words, environment=None):
-    """A short name for a command and all that its run depends on. environment: that of the run (default: that of all tools)."""
+def digest(words, environment=None, directory=""):
+    """A short name for a command and all that its run depends on. environment and directory: those of the run (default: those of all
+    tools, and the current one)."""
     words, environment = [str(word) for word in words], environment or plain_environment()
     variables = {name: value for name, value in environment.items() if name.startswith(LISTENED)}
     programs = list(dict.fromkeys(path for word in words if (path := shutil.which(word))))
@@ -71,7 +76,7 @@ def digest(words, environment=None):
     content = hashlib.sha256()
     for text in [*words, *(f"{name}={variables[name]}" for name in sorted(variables))]:
         content.update(text.encode() + b"\0")
-    for path in files_of([*named, *programs]):
+    for path in files_of([*named, *programs], directory):
         with open(path, "rb") as f:
             content.update(hashlib.file_digest(f, "sha256").digest())
     for path in programs:

@@ -8,7 +8,8 @@ import math
 from pathlib import Path
 
 from . import plots, runs
-from .common import SCENES, SOURCE, make_lung, processor, require, write_table
+from .common import SCENES, SOURCE, processor, require, write_table
+from .keys import make_lung
 from .plots import plt
 from .strategies import measure, solver_words
 

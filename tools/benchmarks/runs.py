@@ -1,11 +1,9 @@
 """Runs of a program that are measured, kept in a folder each, and not repeated when they are there already.
 
-A run is known by its words and by the content of the files among them (program, mesh, option files): a new build or an
-edited option file is a new run. A run that failed is finished too; one that was interrupted is not, nor one that was
+A run is known by its words and by all that it reads (keys.py): a new build, an edited mesh, programme or .petscrc is a new run. A run that failed is finished too; one that was interrupted is not, nor one that was
 ended after less time than it is given now.
 """
 import csv
-import hashlib
 import json
 import os
 import re
@@ -18,19 +16,10 @@ import time
 from pathlib import Path
 
 from .common import environment
+from .keys import digest
 
 STAGES = ["setup", "residual", "jacobian", "solve", "output"]
 POLL = 0.05  # s between looks at a running program
-
-
-def digest(words):
-    """A short name for the words of a command and what is in the files they name."""
-    content = hashlib.sha256()
-    for word in words:
-        content.update(word.encode() + b"\0")
-        if os.path.isfile(word):
-            content.update(Path(word).read_bytes())
-    return content.hexdigest()[:16]
 
 
 def processes(leader):

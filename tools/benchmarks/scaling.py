@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from . import plots, runs
-from .common import PLAIN, SCENES, SOURCE, blas, fail, make_lung, markdown, processor, require, show, write_csv, write_table
+from .common import PLAIN, SCENES, SOURCE, blas, fail, markdown, processor, require, show, write_csv, write_table
+from .keys import make_lung
 from .plots import plt
 from .strategies import solver_words
 
