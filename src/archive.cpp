@@ -13,7 +13,7 @@ namespace {
 
 /// Marks a file of pulmo, and tells how to read it. Raise it when a name or a meaning changes.
 constexpr const char *marker = "pulmo_checkpoint";
-constexpr int format = 2; // 2: the names of the mesh
+constexpr int format = 2; // 2: the names of the mesh, the step sizes of phases
 
 /// @p data is resized to what is there; @p type as in memory.
 template <class T>

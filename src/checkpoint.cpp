@@ -76,7 +76,7 @@ bool same(const Phase &a, const Phase &b)
 {
   return a.name == b.name && a.breath == b.breath && a.control == b.control && same(a.begin, b.begin) &&
          same(a.end, b.end) && same(a.from, b.from) && same(a.to, b.to) && same(a.ramp, b.ramp) &&
-         same(a.limit, b.limit);
+         same(a.limit, b.limit) && same(a.dt, b.dt);
 }
 
 } // namespace
@@ -242,7 +242,7 @@ PetscErrorCode Checkpoint::persist_programme(Archive &archive)
   PetscCall(archive.text("programme_phases", names));
   PetscCall(archive.table("programme", phases, Phase(), [&](Phase &phase, Cells &cells) {
     int control = phase.control == Control::flow;
-    cells(phase.breath, phase.begin, phase.end, control, phase.from, phase.to, phase.ramp, phase.limit);
+    cells(phase.breath, phase.begin, phase.end, control, phase.from, phase.to, phase.ramp, phase.limit, phase.dt);
     phase.control = control ? Control::flow : Control::pressure;
   }));
   PetscCall(archive.value("time_s", time));

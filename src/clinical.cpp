@@ -12,6 +12,9 @@ namespace {
 /// Volumes closer than this share of the tidal volume are the same.
 constexpr double same_volume = 1e-6;
 
+/// So are volumes closer than this share of the volumes themselves.
+constexpr double rounding = 1e-10;
+
 /// Flow below this share of the peak is no flow.
 constexpr double no_flow = 1e-3;
 
@@ -38,10 +41,13 @@ void add_pauses(const std::vector<SignalRow> &rows, std::size_t first, std::size
   for (std::size_t k = 1; k < points.size(); ++k)
     if (rows[points[k].row].volume >= rows[points[fullest].row].volume - same_volume * n.tidal_volume) fullest = k;
 
-  const SignalRow &end = rows[points[fullest].row], &before = rows[before_pause(rows, first, points[fullest].row)];
-  n.plateau_pressure = end.machine_pressure();
-  if (std::abs(end.volume - before.volume) <= same_volume * n.tidal_volume && before.flow > no_flow * n.peak_flow)
-    n.pause_resistance = (before.machine_pressure() - end.machine_pressure()) / before.flow * 1000;
+  if (points[fullest].row == end_of_inspiration(rows, first, last)) {
+    const SignalRow &end = rows[points[fullest].row], &before = rows[before_pause(rows, first, points[fullest].row)];
+    n.plateau_pressure = end.machine_pressure();
+    if (end.flow_resistance && std::abs(end.volume - before.volume) <= same_volume * n.tidal_volume &&
+        before.flow > no_flow * n.peak_flow)
+      n.pause_resistance = (before.machine_pressure() - end.machine_pressure()) / before.flow * 1000;
+  }
 
   // regression of pressure on volume: volumes are given, pressures are the answer (as in eq. 52)
   double P = 0, V = 0, PV = 0, VV = 0;
@@ -87,22 +93,51 @@ std::vector<ClinicalEntry> clinical_entries(const ClinicalNumbers &n, const std:
   };
 }
 
+std::size_t end_of_inspiration(const std::vector<SignalRow> &rows, std::size_t first, std::size_t last)
+{
+  const double start = rows[first].volume;
+  double top = start, size = std::abs(start);
+  for (std::size_t i = first + 1; i <= last; ++i) {
+    top = std::max(top, rows[i].volume);
+    size = std::max(size, std::abs(rows[i].volume));
+  }
+  const double least = top - same_volume * (top - start) - rounding * size;
+  const auto points = static_points(rows, first, last);
+  const auto pause = std::find_if(points.rbegin(), points.rend(),
+                                  [&](const StaticPoint &point) { return rows[point.row].volume >= least; });
+  if (pause != points.rend()) return pause->row;
+  if (start >= least) return first;
+  std::size_t i = first + 1;
+  while (rows[i].volume < least) ++i;
+  while (i < last && rows[i + 1].phase == rows[i].phase && rows[i + 1].volume >= least) ++i;
+  return i;
+}
+
 std::vector<BreathRows> breath_rows(const std::vector<SignalRow> &rows)
 {
   std::vector<BreathRows> list;
   for (std::size_t i = 1; i < rows.size(); ++i) {
     if (rows[i].breath < 1) continue;
     if (list.empty() || rows[i].breath != rows[i - 1].breath || rows[i - 1].dt == 0) list.push_back({i - 1, i, i - 1});
-    BreathRows &b = list.back();
-    b.last = i;
-    if (rows[i].volume > rows[b.fullest].volume) b.fullest = i;
+    list.back().last = i;
   }
+  for (BreathRows &b : list) {
+    b.fullest = end_of_inspiration(rows, b.first, b.last);
+    b.complete = !rows[b.last].cut;
+  }
+  return list;
+}
+
+std::vector<BreathRows> complete_breaths(const std::vector<SignalRow> &rows)
+{
+  auto list = breath_rows(rows);
+  list.erase(std::remove_if(list.begin(), list.end(), [](const BreathRows &b) { return !b.complete; }), list.end());
   return list;
 }
 
 BreathRows last_breath(const std::vector<SignalRow> &rows)
 {
-  const auto breaths = breath_rows(rows);
+  const auto breaths = complete_breaths(rows);
   return breaths.empty() ? BreathRows{0, rows.size() - 1, rows.size() - 1} : breaths.back();
 }
 
@@ -118,13 +153,13 @@ std::vector<StaticPoint> static_points(const std::vector<SignalRow> &rows, std::
 }
 
 void fit_single_compartment(const std::vector<SignalRow> &rows, std::size_t first, std::size_t last, double peep,
-                            ClinicalNumbers &numbers)
+                            ClinicalNumbers &numbers, std::optional<double> start)
 {
-  const double start = rows[first].volume;
+  const double V_start = start.value_or(rows[first].volume);
   double VV = 0, VQ = 0, QQ = 0, PV = 0, PQ = 0; // normal equations
   for (std::size_t i = first + 1; i <= last; ++i) {
     const SignalRow &r = rows[i];
-    const double P = r.machine_pressure() - peep, V = r.volume - start, Q = r.flow, w = r.dt;
+    const double P = r.machine_pressure() - peep, V = r.volume - V_start, Q = r.flow, w = r.dt;
     VV += w * V * V;
     VQ += w * V * Q;
     QQ += w * Q * Q;
@@ -136,6 +171,7 @@ void fit_single_compartment(const std::vector<SignalRow> &rows, std::size_t firs
   const double E = (PV * QQ - PQ * VQ) / determinant, R = (PQ * VV - PV * VQ) / determinant;
   if (!(E > 0)) return;
   numbers.compliance = 1 / E;
+  if (!rows[last].flow_resistance) return; // R would be what the curve of P over V leaves of a line
   numbers.resistance = R * 1000;
   numbers.time_constant = R / E;
 }
@@ -175,20 +211,65 @@ ClinicalNumbers clinical_numbers(const std::vector<SignalRow> &rows, std::size_t
 std::vector<ClinicalNumbers> breath_numbers(const std::vector<SignalRow> &rows)
 {
   std::vector<ClinicalNumbers> list;
-  for (const BreathRows &b : breath_rows(rows)) list.push_back(clinical_numbers(rows, b.first, b.last));
+  for (const BreathRows &b : complete_breaths(rows)) list.push_back(clinical_numbers(rows, b.first, b.last));
   return list;
 }
 
 ClinicalNumbers overall_numbers(const std::vector<SignalRow> &rows)
 {
-  const auto list = breath_rows(rows);
+  const auto list = complete_breaths(rows);
   if (list.empty()) return {};
   ClinicalNumbers n = clinical_numbers(rows, list.back().first, list.back().last);
+  const SignalRow &rest = rows[list.front().first];
   n.compliance.reset();
   n.resistance.reset();
   n.time_constant.reset();
-  fit_single_compartment(rows, list.front().first, list.back().last, rows[list.front().first].machine_pressure(), n);
+  fit_single_compartment(rows, list.back().first, list.back().last, rest.machine_pressure(), n, rest.volume);
   return n;
+}
+
+std::vector<ClinicalEntry> overall_entries(const std::vector<SignalRow> &rows, const std::optional<double> &frc)
+{
+  auto entries = clinical_entries(overall_numbers(rows), frc);
+  if (complete_breaths(rows).empty())
+    for (ClinicalEntry &e : entries) e.value.reset();
+  return entries;
+}
+
+std::optional<Unsteadiness> unsteadiness(const std::vector<SignalRow> &rows)
+{
+  const auto breaths = complete_breaths(rows);
+  if (breaths.empty()) return {};
+  Unsteadiness largest;
+  const ClinicalNumbers n = clinical_numbers(rows, breaths.back().first, breaths.back().last);
+  const auto look_at = [&](const char *what, std::optional<double> difference, std::optional<double> whole) {
+    if (!difference || !whole || *whole == 0 || std::abs(*difference / *whole) <= largest.change) return;
+    largest = {std::abs(*difference / *whole), what};
+  };
+  look_at("trapped volume over the tidal volume", n.trapped_volume, n.tidal_volume);
+  if (breaths.size() > 1 && breaths[breaths.size() - 2].last == breaths.back().first) {
+    const BreathRows &b = breaths[breaths.size() - 2];
+    const ClinicalNumbers before = clinical_numbers(rows, b.first, b.last);
+    const auto change = [&](const char *what, std::optional<double> now, std::optional<double> then) {
+      if (now && then) look_at(what, *now - *then, now);
+    };
+    change("change of the tidal volume from the breath before", n.tidal_volume, before.tidal_volume);
+    change("change of C_rs from the breath before", n.compliance, before.compliance);
+    change("change of R from the breath before", n.resistance, before.resistance);
+  }
+  return largest;
+}
+
+std::optional<double> unsettled_volume(const std::vector<SignalRow> &rows)
+{
+  const auto breaths = breath_rows(rows);
+  if (breaths.empty() || breaths.front().first == 0) return {};
+  const std::size_t last = breaths.front().first;
+  const SignalRow &end = rows[last], &before = rows[last - 1];
+  if (!end.flow_resistance) return {};
+  if (end.flow == 0) return 0;
+  const double fading = last > 1 ? (before.flow / end.flow - 1) / end.dt : 0; // 1/s, of a step of backward Euler
+  return std::abs(end.flow) * (fading > 0 ? 1 / fading : end.time);
 }
 
 } // namespace pulmo

@@ -150,8 +150,10 @@ PetscErrorCode check_other_mesh(MPI_Comm comm, const ErrorLevel &run, const Erro
 }
 
 /// Options that make steps @p factor times as long.
-PetscErrorCode coarser_steps(const Simulation &simulation, int factor, OptionList &changes)
+PetscErrorCode coarser_steps(const Scene &scene, const Simulation &simulation, int factor, OptionList &changes)
 {
+  const auto &phases = scene.facts().ventilator->phases();
+  PetscReal scale = 1;
   const StepControl &control = simulation.step_control();
   const double looser = std::pow(factor, simulation.scheme().order() + 1); // a step's error is of order dt^(order + 1)
   TSAdapt adapt;
@@ -159,6 +161,10 @@ PetscErrorCode coarser_steps(const Simulation &simulation, int factor, OptionLis
 
   PetscFunctionBeginUser;
   changes.emplace_back("-ts_dt", text_of(factor * simulation.wanted_dt()));
+  if (std::any_of(phases.begin(), phases.end(), [](const Phase &p) { return p.dt.has_value(); })) {
+    PetscCall(PetscOptionsGetReal(nullptr, nullptr, "-ventilator_dt_scale", &scale, nullptr));
+    changes.emplace_back("-ventilator_dt_scale", text_of(factor * scale));
+  }
   if (!control.in_use()) PetscFunctionReturn(PETSC_SUCCESS);
   changes.emplace_back("-step_volume_tolerance", text_of(looser * control.volume_tolerance()));
   changes.emplace_back("-step_pressure_tolerance", text_of(looser * control.pressure_tolerance()));
@@ -341,8 +347,8 @@ PetscErrorCode ErrorEstimate::make(const Options &options, const Output &output,
   levels[fine].name = "the run itself";
   levels[fine].seconds = simulation.seconds().total;
   levels[fine].numbers = numbers;
-  PetscCall(coarser_steps(simulation, 2, changes[twice]));
-  PetscCall(coarser_steps(simulation, 4, changes[four_times]));
+  PetscCall(coarser_steps(scene, simulation, 2, changes[twice]));
+  PetscCall(coarser_steps(scene, simulation, 4, changes[four_times]));
   changes[tight] = changes[other] = changes[four_times];
   PetscCall(tighter_solver(simulation, changes[tight]));
   PetscCall(other_mesh(changes[other], levels[other].name));

@@ -108,8 +108,8 @@ PetscErrorCode Simulation::resume(const Archive &archive, PetscInt index, PetscR
   PetscCall(archive.check(index >= 0 && index < static_cast<PetscInt>(phases_.size()), "phase"));
   phase_ = &phases_[static_cast<std::size_t>(index)];
   airway_.begin_phase(*phase_, 0, 0);
-  const bool new_dt = wanted_dt != wanted_dt_ || (!step_control_.in_use() && dt_ > wanted_dt_);
-  if (new_dt) dt_ = wanted_dt_;
+  const bool new_dt = (!phase_->dt && wanted_dt != wanted_dt_) || (!step_control_.in_use() && dt_ > asked_dt());
+  if (new_dt) dt_ = asked_dt();
   if (new_dt || phase_end != phase_->end) next_dt_ = landing(accepted_.time);
   resumed_ = true;
   PetscFunctionReturn(PETSC_SUCCESS);

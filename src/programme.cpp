@@ -55,6 +55,25 @@ bool Programme::limits_pressure() const
   return std::any_of(phases_.begin(), phases_.end(), [](const Phase &p) { return p.limit.has_value(); });
 }
 
+bool Programme::breathes() const
+{
+  return std::any_of(phases_.begin(), phases_.end(), [](const Phase &p) { return p.breath > 0; });
+}
+
+PetscReal Programme::end_of_breath(PetscInt breath) const
+{
+  const auto last = std::find_if(phases_.rbegin(), phases_.rend(), [&](const Phase &p) { return p.breath == breath; });
+  return last == phases_.rend() ? 0 : last->end;
+}
+
+void ProgrammeBuilder::append(Phase phase)
+{
+  const PetscReal duration = phase.end - phase.begin;
+  phase.begin = phases_.empty() ? 0 : phases_.back().end;
+  phase.end = phase.begin + duration;
+  phases_.push_back(std::move(phase));
+}
+
 Phase &ProgrammeBuilder::add(const std::string &name, PetscInt breath, PetscReal duration, Control control,
                              PetscReal value, PetscReal ramp, std::optional<PetscReal> from)
 {
@@ -172,13 +191,12 @@ private:
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
-  /// NAME DURATION pressure|flow VALUE [from VALUE] [ramp SECONDS] [limit CMH2O], or NAME DURATION hold.
+  /// A phase: NAME DURATION pressure|flow VALUE or NAME DURATION hold, and words of words().
   PetscErrorCode phase(const Line &line)
   {
     const auto &w = line.words;
     PetscReal duration, value = 0;
-    std::optional<PetscReal> from, limit, ramp_given;
-    std::size_t next = 3;
+    Words more;
 
     PetscFunctionBeginUser;
     PulmoUserCheck(std::all_of(w[0].begin(), w[0].end(),
@@ -200,40 +218,71 @@ private:
       PulmoUserCheck(w.size() >= 4, comm_, "%s:%d: '%s' needs a value in %s", file_.c_str(), line.number, w[2].c_str(),
                      control == Control::pressure ? "cmH2O" : "ml/s");
       PetscCall(number(line, 3, control == Control::pressure ? "the pressure (cmH2O)" : "the flow (ml/s)", value));
-      next = 4;
     }
-    for (; next < w.size(); next += 2) {
-      const std::string &key = w[next];
-      PulmoUserCheck(!hold && (key == "ramp" || key == "from" || (key == "limit" && control == Control::flow)), comm_,
-                     "%s:%d: '%s' does not belong to a %s phase; %s", file_.c_str(), line.number, key.c_str(),
-                     w[2].c_str(),
-                     hold                       ? "hold takes nothing more"
-                     : control == Control::flow ? "it may have 'from', 'ramp' and 'limit'"
-                                                : "it may have 'from' and 'ramp'");
-      PulmoUserCheck(next + 1 < w.size(), comm_, "%s:%d: '%s' needs a number", file_.c_str(), line.number, key.c_str());
-      PetscReal x;
-      PetscCall(number(line, next + 1, "'" + key + "'", x));
-      std::optional<PetscReal> &given = key == "ramp" ? ramp_given : key == "from" ? from : limit;
-      PulmoUserCheck(!given, comm_, "%s:%d: '%s' is given twice; keep one", file_.c_str(), line.number, key.c_str());
-      given = x;
-    }
-    const PetscReal ramp = ramp_given.value_or(0);
+    PetscCall(words(line, hold ? 3 : 4, more));
+    const PetscReal ramp = more.ramp.value_or(0);
     PulmoUserCheck(ramp >= 0 && ramp <= duration, comm_,
                    "%s:%d: the ramp %g s must lie between 0 and the duration %g s of phase '%s'", file_.c_str(),
                    line.number, (double)ramp, (double)duration, w[0].c_str());
-    PulmoUserCheck(!from || ramp > 0, comm_, "%s:%d: 'from' is the start of a ramp; give 'ramp' too", file_.c_str(),
-                   line.number);
-    for (const PetscReal x : {value, from.value_or(0), limit.value_or(0)})
+    PulmoUserCheck(!more.from || ramp > 0, comm_, "%s:%d: 'from' is the start of a ramp; give 'ramp' too",
+                   file_.c_str(), line.number);
+    PulmoUserCheck(!more.dt || *more.dt >= least_duration, comm_, "%s:%d: 'dt' must be positive, at least %g s",
+                   file_.c_str(), line.number, (double)least_duration);
+    for (const PetscReal x : {value, more.from.value_or(0), more.limit.value_or(0)})
       PulmoUserCheck(std::abs(x) <= largest_value, comm_, "%s:%d: %g is beyond what a ventilator gives; check the unit",
                      file_.c_str(), line.number, (double)x);
     time_ += duration;
     PulmoUserCheck(time_ <= longest_run, comm_, "%s:%d: the phases last longer than %g s; shorten '%s'", file_.c_str(),
                    line.number, (double)longest_run, w[0].c_str());
-    if (w[0] == "inspiration") ++breath_;
+    if (more.breath || w[0] == "inspiration") ++breath_;
     PulmoUserCheck(++phases_ <= max_phases, comm_, "%s:%d: more than %d phases; check the counts of 'repeat'",
                    file_.c_str(), line.number, (int)max_phases);
-    Phase &added = builder_.add(w[0], breath_, duration, control, value, ramp, from);
-    if (limit) added.limit = internal(Control::pressure, *limit);
+    Phase &added = builder_.add(w[0], breath_, duration, control, value, ramp, more.from);
+    if (more.limit) added.limit = internal(Control::pressure, *more.limit);
+    added.dt = more.dt;
+    added.where = file_ + ":" + std::to_string(line.number);
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+  /// What may follow the value of a phase.
+  struct Words {
+    std::optional<PetscReal> from, ramp, limit, dt; // cmH2O or ml/s, s, cmH2O, s
+    bool breath = false;
+  };
+
+  /// [ramp SECONDS] [from VALUE] [limit CMH2O] [dt SECONDS] [breath] from word @p next on.
+  PetscErrorCode words(const Line &line, std::size_t next, Words &given) const
+  {
+    const auto &w = line.words;
+    const bool hold = w[2] == "hold", flow = w[2] == "flow";
+
+    PetscFunctionBeginUser;
+    while (next < w.size()) {
+      const std::string &key = w[next];
+      if (key == "breath") {
+        PulmoUserCheck(!given.breath, comm_, "%s:%d: 'breath' is given twice; keep one", file_.c_str(), line.number);
+        given.breath = true;
+        ++next;
+        continue;
+      }
+      std::optional<PetscReal> *const number_of = key == "dt"              ? &given.dt
+                                                  : key == "ramp" && !hold ? &given.ramp
+                                                  : key == "from" && !hold ? &given.from
+                                                  : key == "limit" && flow ? &given.limit
+                                                                           : nullptr;
+      PulmoUserCheck(number_of, comm_, "%s:%d: '%s' does not belong to a %s phase; it may have %s", file_.c_str(),
+                     line.number, key.c_str(), w[2].c_str(),
+                     hold   ? "'dt' and 'breath'"
+                     : flow ? "'from', 'ramp', 'limit', 'dt' and 'breath'"
+                            : "'from', 'ramp', 'dt' and 'breath'");
+      PulmoUserCheck(next + 1 < w.size(), comm_, "%s:%d: '%s' needs a number", file_.c_str(), line.number, key.c_str());
+      PetscReal x;
+      PetscCall(number(line, next + 1, "'" + key + "'", x));
+      PulmoUserCheck(!*number_of, comm_, "%s:%d: '%s' is given twice; keep one", file_.c_str(), line.number,
+                     key.c_str());
+      *number_of = x;
+      next += 2;
+    }
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 

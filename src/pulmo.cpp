@@ -115,6 +115,18 @@ PetscErrorCode keep_last_state(Checkpoint &checkpoint, const Simulation &simulat
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+/// Says so before the run if it will have no numbers of a breath.
+PetscErrorCode note_no_breath(MPI_Comm comm, const Scene &scene)
+{
+  PetscFunctionBeginUser;
+  if (!scene.facts().ventilator || scene.facts().ventilator->breathes()) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(PetscPrintf(comm,
+                        "pulmo: note: %s. The numbers of breaths will be null; the static curve has the end of each "
+                        "pause (a phase named 'pause', or of 'hold')\n",
+                        why_no_numbers(scene, {}).c_str()));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 /// Says when the run first left the range of the model: below J = 1 - Phi0 the porosity is negative, and no tissue law
 /// but berger keeps J from it.
 PetscErrorCode warn_of_no_air(MPI_Comm comm, const Scene &scene, const Simulation &simulation)
@@ -216,6 +228,7 @@ PetscErrorCode Run::setup()
   Composition composition(scene_.mesh(), scene_.facts().elements);
   PetscCall(scene_.compose(composition));
   PetscCall(model_.build(std::move(composition), reference_modulus(scene_.tissue().law())));
+  PetscCall(settle_under_loads(scene_, model_, settle_note_));
   PetscCall(simulation_.setup());
   PetscCall(PetscTime(&end));
   simulation_.setup_took(end - start);
@@ -255,6 +268,8 @@ PetscErrorCode run(const Registry &registry, bool &finished)
     PetscFunctionReturn(PETSC_SUCCESS);
   }
   PetscCall(check_held(comm, scene, run.model().composition()));
+  if (!run.settle_note().empty()) PetscCall(PetscPrintf(comm, "pulmo: note: %s\n", run.settle_note().c_str()));
+  PetscCall(note_no_breath(comm, scene));
   PetscCall(error_estimate.check(options, scene));
   const Elements &elements = scene.facts().elements;
   PulmoUserCheck(!output.error_indicator() || (elements.displacement == 2 && elements.pressure == 1), comm,
@@ -315,9 +330,10 @@ PetscErrorCode run(const Registry &registry, bool &finished)
   PetscCall(signals.finish());
   PetscCall(write_summary(options, output, scene, run.model(), simulation, audits, true));
   PetscCall(print_numbers(comm, output, scene, simulation, audits));
-  if (error_estimate.in_use() && (asked_to_stop || breath_rows(simulation.rows()).empty())) {
+  const std::vector<SignalRow> rows = regions.complete(simulation.rows());
+  if (error_estimate.in_use() && (asked_to_stop || complete_breaths(rows).empty())) {
     PetscCall(PetscPrintf(comm, "pulmo: warning: no error estimate: %s\n",
-                          asked_to_stop ? "the run was asked to stop" : "the run ends before its first breath"));
+                          asked_to_stop ? "the run was asked to stop" : why_no_numbers(scene, rows).c_str()));
   } else if (error_estimate.in_use()) {
     ErrorReport report;
     PetscCall(error_estimate.make(options, output, scene, simulation, regions.numbers(simulation.rows()), report));

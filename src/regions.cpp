@@ -12,6 +12,9 @@ namespace {
 /// Moments of J - 1 and of p - P over a region.
 enum Moment { J1, J2, p1, p2, n_moments };
 
+/// Two times of a run closer than this share are the same.
+constexpr double same_time = 1e-9;
+
 } // namespace
 
 PetscErrorCode RegionAudit::setup()
@@ -92,8 +95,15 @@ PetscErrorCode RegionAudit::persist(Archive &archive, Vec)
 
 std::vector<SignalRow> RegionAudit::complete(std::vector<SignalRow> rows) const
 {
-  if (scene_.facts().airflow)
-    for (std::size_t i = 0; i < rows.size(); ++i) rows[i].alveolar_pressure = rows_[i].back().mean_pressure;
+  const SceneFacts &facts = scene_.facts();
+  for (std::size_t i = 0; i < rows.size(); ++i) {
+    if (facts.airflow) rows[i].alveolar_pressure = rows_[i].back().mean_pressure;
+    rows[i].flow_resistance = facts.airflow || facts.tube;
+  }
+  if (facts.ventilator && rows.back().breath > 0) {
+    const double end = facts.ventilator->end_of_breath(rows.back().breath);
+    rows.back().cut = rows.back().time < end * (1 - same_time);
+  }
   return rows;
 }
 

@@ -15,6 +15,9 @@ namespace {
 /// Two times closer than this share of the step are the same.
 constexpr PetscReal same_time = 1e-9;
 
+/// A pressure is above a limit if it is so by more than this, cmH2O.
+constexpr PetscReal same_pressure = 1e-6;
+
 /// A step may be longer by this share to land on a time, so that no sliver of a step is left.
 constexpr PetscReal stretch = 0.01;
 
@@ -134,7 +137,7 @@ std::vector<Phase> Simulation::phases() const
 
 bool Simulation::same(PetscReal t, PetscReal other) const
 {
-  return std::abs(t - other) <= same_time * wanted_dt_;
+  return std::abs(t - other) <= same_time * asked_dt();
 }
 
 PetscReal Simulation::landing(PetscReal t) const
@@ -151,13 +154,13 @@ PetscReal Simulation::next_step(PetscReal t, PetscReal h, TSAdapt adapt, PetscBo
     if (cut_)
       dt_ = h; // it took cuts to get here
     else if (h >= dt_ * (1 - same_time))
-      dt_ = std::min(wanted_dt_, adapt->clip[1] * dt_); // a full step: grow back
+      dt_ = std::min(asked_dt(), adapt->clip[1] * dt_); // a full step: grow back
     return landing(t + h);
   }
   const int order = scheme_.order();
   const auto error = step_control_.error(order, candidate_, airway_.free_values());
   const PetscReal growth = error ? StepControl::growth(order, *error) : 1,
-                  least = std::max(adapt->dt_min, least_step * wanted_dt_);
+                  least = std::max(adapt->dt_min, least_step * asked_dt());
   if (error && *error > 1 && growth * h > least) {
     accept = PETSC_FALSE;
     ++rejected_;
@@ -172,7 +175,7 @@ PetscReal Simulation::next_step(PetscReal t, PetscReal h, TSAdapt adapt, PetscBo
 void Simulation::begin_smooth_stretch()
 {
   step_control_.restart({accepted_.time, accepted_.volume, accepted_.pressure});
-  if (step_control_.in_use()) dt_ = wanted_dt_;
+  if (step_control_.in_use()) dt_ = asked_dt();
 }
 
 PetscErrorCode Simulation::start()
@@ -191,8 +194,9 @@ PetscErrorCode Simulation::start()
     accepted_.pressure = phases_.front().from.value_or(0) / units::kPa_per_cmH2O;
   accepted_.ventilator_pressure = accepted_.pressure;
   PetscCall(scheme_.begin(model_, 0, measures.volume_change, before_));
+  PetscCall(warn_of_low_limits());
   PetscCall(report(accepted_, measures));
-  dt_ = wanted_dt_;
+  dt_ = asked_dt();
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -211,9 +215,12 @@ PetscErrorCode Simulation::run(bool &finished)
     if (resumed_ && &phase < phase_) continue;
     resumed_ = false;
     if (within && same(accepted_.time, phase.end)) continue;
+    const PetscReal asked_before = asked_dt();
     phase_ = &phase;
     if (!within) {
-      airway_.begin_phase(phase, accepted_.volume * units::mm3_per_ml, std::min(wanted_dt_, phase.end - phase.begin));
+      if (asked_dt() != asked_before) dt_ = asked_dt();
+      PetscCall(warn_of_low_limit(phase, accepted_.machine_pressure()));
+      airway_.begin_phase(phase, accepted_.volume * units::mm3_per_ml, std::min(asked_dt(), phase.end - phase.begin));
       begin_smooth_stretch();
       next_dt_ = landing(phase.begin);
     }
@@ -235,6 +242,34 @@ PetscErrorCode Simulation::run(bool &finished)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode Simulation::warn_of_low_limits()
+{
+  PetscReal pressure = accepted_.machine_pressure();
+  bool known = true;
+
+  PetscFunctionBeginUser;
+  for (const Phase &phase : phases_) {
+    if (known) PetscCall(warn_of_low_limit(phase, pressure));
+    known = phase.control == Control::pressure;
+    pressure = phase.to / units::kPa_per_cmH2O;
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Simulation::warn_of_low_limit(const Phase &phase, PetscReal pressure)
+{
+  PetscFunctionBeginUser;
+  if (!phase.limit) PetscFunctionReturn(PETSC_SUCCESS);
+  const PetscReal limit = *phase.limit / units::kPa_per_cmH2O;
+  if (pressure <= limit + same_pressure || !low_limits_.insert(phase.where).second) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(PetscPrintf(options_.comm(),
+                        "pulmo: warning: %s: phase '%s' begins at %.4g cmH2O, above its own limit of %.4g cmH2O: the "
+                        "limit is held from its first step on, and gas flows out; raise 'limit', or lower the pressure "
+                        "before the phase\n",
+                        phase.where.c_str(), phase.name.c_str(), (double)pressure, (double)limit));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode Simulation::before_stage(PetscReal t)
 {
   PetscReal begin, dt;
@@ -244,7 +279,7 @@ PetscErrorCode Simulation::before_stage(PetscReal t)
   PetscCall(TSGetTimeStep(ts_, &dt));
   PetscCall(scheme_.begin_stage(t, dt));
   airway_.begin_stage(t, begin + dt);
-  model_.set_load(std::min<PetscReal>(1, (begin + dt) / std::min(wanted_dt_, end_)));
+  model_.set_load(std::min<PetscReal>(1, (begin + dt) / std::min(phases_.front().dt.value_or(wanted_dt_), end_)));
   extra_newton_ = 0;
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -530,7 +565,7 @@ PetscErrorCode Simulation::reject(PetscReal dt, const std::string &reason, Petsc
   PetscCall(TSRestartStep(ts_)); // BDF and -ts_theta_initial_guess_extrapolate must not look at a failed state
   PetscCall(TSGetAdapt(ts_, &adapt));
   const PetscReal next = dt * adapt->scale_solve_failed;
-  if (next < std::max(adapt->dt_min, least_step * wanted_dt_))
+  if (next < std::max(adapt->dt_min, least_step * asked_dt()))
     PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
   PetscCall(heed_signal(TS_DIVERGED_STEP_REJECTED));
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -554,7 +589,7 @@ PetscErrorCode Simulation::after_step()
   row.dt = t - accepted_.time;
   cut_ = false;
   const bool landed = same(t, phase_->end) || same(t, phase_->begin + phase_->ramp);
-  crawled_ = row.dt < crawling_step * wanted_dt_ && !landed && !failures_.empty() ? crawled_ + 1 : 0;
+  crawled_ = row.dt < crawling_step * asked_dt() && !landed && !failures_.empty() ? crawled_ + 1 : 0;
   if (crawled_ == 0) failures_.clear();
 
   // state and consistent flux of the accepted step

@@ -16,15 +16,21 @@ Json optional_json(const std::optional<double> &v)
   return v ? Json(*v) : Json(nullptr);
 }
 
-void add_numbers(Json &json, const ClinicalNumbers &n, const std::optional<double> &frc)
+/// A breath; one that was cut has null for each number, and the fit over the rows that there are.
+Json breath_json(const std::vector<SignalRow> &rows, const BreathRows &b, const std::optional<double> &frc)
 {
-  for (const ClinicalEntry &e : clinical_entries(n, frc)) json[e.key] = optional_json(e.value);
-}
-
-/// The same keys for a run without a breath.
-void add_no_numbers(Json &json)
-{
-  for (const ClinicalEntry &e : clinical_entries({}, {})) json[e.key] = nullptr;
+  const ClinicalNumbers numbers = clinical_numbers(rows, b.first, b.last);
+  Json json;
+  json["complete"] = b.complete;
+  json["start_s"] = rows[b.first].time;
+  json["end_of_inspiration_s"] = b.complete ? Json(rows[b.fullest].time) : Json(nullptr);
+  json["end_s"] = rows[b.last].time;
+  for (const ClinicalEntry &e : clinical_entries(numbers, frc))
+    json[e.key] = b.complete ? optional_json(e.value) : Json(nullptr);
+  if (!b.complete)
+    json["fit_until_cut"] = {{"compliance_ml_per_cmH2O", optional_json(numbers.compliance)},
+                             {"resistance_cmH2O_s_per_l", optional_json(numbers.resistance)}};
+  return json;
 }
 
 /// The end of every pause of the run.
@@ -94,6 +100,13 @@ Json errors_json(const ErrorReport &report)
 
 } // namespace
 
+std::string why_no_numbers(const Scene &scene, const std::vector<SignalRow> &rows)
+{
+  if (!scene.facts().ventilator->breathes())
+    return "no phase of the programme begins a breath: name one 'inspiration', or add the word 'breath' to its line";
+  return breath_rows(rows).empty() ? "the run ends before its first breath" : "the run ends within its first breath";
+}
+
 PetscErrorCode write_summary(const Options &options, const Output &output, const Scene &scene, const Model &model,
                              const Simulation &simulation, const Audits &audits, bool finished)
 {
@@ -116,19 +129,25 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
     const auto frc = scene.functional_residual_capacity();
     const std::vector<SignalRow> rows = audits.regions.complete(simulation.rows());
     if (scene.facts().ventilator) {
-      if (breath_rows(rows).empty())
-        add_no_numbers(json);
-      else
-        add_numbers(json, overall_numbers(rows), frc);
+      const auto complete = complete_breaths(rows);
+      for (const ClinicalEntry &e : overall_entries(rows, frc)) json[e.key] = optional_json(e.value);
+      json["numbers_of_breath"] = complete.empty() ? Json(nullptr) : Json(rows[complete.back().last].breath);
+      if (complete.empty()) json["why_no_numbers"] = why_no_numbers(scene, rows);
+      const auto unsteady = unsteadiness(rows);
+      json["steady"] = unsteady ? Json(unsteady->steady()) : Json(nullptr);
+      json["steady_change"] = unsteady ? Json(unsteady->change) : Json(nullptr);
+      json["unsettled_volume_ml"] = optional_json(unsettled_volume(rows));
       json["static_curve"] = static_curve(rows);
       json["breaths"] = Json::array();
       for (const BreathRows &b : breath_rows(rows)) {
-        Json breath;
-        add_numbers(breath, clinical_numbers(rows, b.first, b.last), frc);
+        Json breath = breath_json(rows, b, frc);
         if (audits.energy) {
           const auto &energy = audits.energy->rows();
-          breath["energy_j"] = energy_json(*audits.energy, energy[b.last] - energy[b.first]);
-          breath["inspiratory_energy_j"] = energy_json(*audits.energy, energy[b.fullest] - energy[b.first]);
+          const auto until = [&](std::size_t row) {
+            return b.complete ? energy_json(*audits.energy, energy[row] - energy[b.first]) : Json(nullptr);
+          };
+          breath["energy_j"] = until(b.last);
+          breath["inspiratory_energy_j"] = until(b.fullest);
         }
         json["breaths"].push_back(breath);
       }

@@ -9,7 +9,7 @@ namespace pulmo {
 
 namespace {
 
-/// The balance of the last breath (without one: of the run), beside that of its filling.
+/// The balance of the last complete breath (without one: of the run), beside that of its inspiration.
 PetscErrorCode print_energy(MPI_Comm comm, const EnergyAudit &audit, const BreathRows &breath, const char *span)
 {
   const EnergyBalance whole = audit.rows()[breath.last] - audit.rows()[breath.first],
@@ -19,7 +19,7 @@ PetscErrorCode print_energy(MPI_Comm comm, const EnergyAudit &audit, const Breat
   };
 
   PetscFunctionBeginUser;
-  PetscCall(PetscPrintf(comm, "\n%-30s %12s %12s\n", "Energy", span, "to the peak"));
+  PetscCall(PetscPrintf(comm, "\n%-30s %12s %12s\n", "Energy", span, "inspiration"));
   PetscCall(line("ventilator_work", whole.ventilator_work, filling.ventilator_work));
   for (std::size_t i = 0; i < audit.accounts().size(); ++i)
     if (whole.accounts[i] != 0 || filling.accounts[i] != 0)
@@ -44,6 +44,37 @@ PetscErrorCode print_regions(MPI_Comm comm, const RegionAudit &audit, const Brea
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+/// What the clinical numbers leave out, or what they are not yet.
+PetscErrorCode print_notes(MPI_Comm comm, const Scene &scene, const std::vector<SignalRow> &rows)
+{
+  const auto breaths = breath_rows(rows);
+  const auto unsettled = unsettled_volume(rows);
+  const auto unsteady = unsteadiness(rows);
+
+  PetscFunctionBeginUser;
+  if (!unsteady) PetscCall(PetscPrintf(comm, "\nNo numbers of a breath: %s.\n", why_no_numbers(scene, rows).c_str()));
+  if (breaths.empty()) PetscFunctionReturn(PETSC_SUCCESS);
+  const SignalRow &end = rows.back();
+  if (end.cut)
+    PetscCall(PetscPrintf(comm,
+                          "pulmo: note: the run ends at t = %.6g s, within breath %d, which would end at %.6g s: that "
+                          "breath has no numbers\n",
+                          end.time, end.breath, (double)scene.facts().ventilator->end_of_breath(end.breath)));
+  if (unsteady && !unsteady->steady())
+    PetscCall(PetscPrintf(comm,
+                          "pulmo: note: not a steady breath yet: %s: %.3g %% (steady: up to %.3g %%); more breaths, or "
+                          "longer ones, tell whether the numbers still change\n",
+                          unsteady->what.c_str(), 100 * unsteady->change, 100 * Unsteadiness::tolerated));
+  const double tidal = clinical_numbers(rows, breaths.back().first, breaths.back().last).tidal_volume;
+  if (unsettled && *unsettled > unsettled_tolerated * tidal)
+    PetscCall(PetscPrintf(comm,
+                          "pulmo: warning: the first breath starts at t = %.6g s before the lung is at rest: at least "
+                          "%.3g ml are still to come, %.3g %% of the tidal volume, and count as breath; give a longer "
+                          "-ventilator_settle_duration (in a programme: a longer phase before the first breath)\n",
+                          rows[breaths.front().first].time, *unsettled, 100 * *unsettled / tidal));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 } // namespace
 
 PetscErrorCode print_numbers(MPI_Comm comm, const Output &output, const Scene &scene, const Simulation &simulation,
@@ -53,17 +84,18 @@ PetscErrorCode print_numbers(MPI_Comm comm, const Output &output, const Scene &s
   const BreathRows breath = last_breath(rows);
 
   PetscFunctionBeginUser;
-  const bool breathes = !breath_rows(rows).empty();
+  const bool breathes = !complete_breaths(rows).empty();
   if (breathes) {
-    PetscCall(PetscPrintf(comm,
-                          "\n%s tissue, %.0f ml at rest: clinical numbers of the last breath (fits over all breaths)\n",
-                          scene.tissue().law().name(), (double)(scene.mesh().volume() / units::mm3_per_ml)));
+    PetscCall(PetscPrintf(comm, "\n%s tissue, %.0f ml at rest: clinical numbers of breath %d\n",
+                          scene.tissue().law().name(), (double)(scene.mesh().volume() / units::mm3_per_ml),
+                          rows[breath.last].breath));
     for (const ClinicalEntry &e : audits.regions.numbers(simulation.rows())) {
       if (!e.value) continue;
       const double shown = std::abs(*e.value) < 1e-9 ? 0 : *e.value; // what the solver left of a zero
       PetscCall(PetscPrintf(comm, "  %-28s %12.4g %s\n", e.label, shown, e.unit));
     }
   }
+  if (scene.facts().ventilator) PetscCall(print_notes(comm, scene, rows));
   if (audits.energy) PetscCall(print_energy(comm, *audits.energy, breath, breathes ? "breath" : "run"));
   if (audits.regions.regions().size() > 1) PetscCall(print_regions(comm, audits.regions, breath));
   PetscCall(PetscPrintf(comm, "\nSmallest J %.4f", (double)simulation.min_J()));

@@ -23,6 +23,8 @@ struct SignalRow {
   bool hold = false;                         ///< the phase holds the volume (prescribed flow 0)
   std::optional<double> ventilator_pressure; ///< on the machine's side of a tube, cmH2O; without one the airway's
   std::optional<double> alveolar_pressure;   ///< mean over the reference volume, cmH2O; empty without airflow
+  bool flow_resistance = true;               ///< something resists the flow: airflow through the tissue, or a tube
+  bool cut = false;                          ///< the run ends here, before its breath does
 
   /// What a clinician reads: the pressure at the machine, cmH2O.
   double machine_pressure() const { return ventilator_pressure.value_or(pressure); }
@@ -35,7 +37,7 @@ struct ClinicalNumbers {
   std::optional<double> compliance;         ///< C_rs of the fit, ml/cmH2O
   std::optional<double> resistance;         ///< R of the fit, cmH2O s/l
   std::optional<double> time_constant;      ///< R C_rs, s
-  std::optional<double> plateau_pressure;   ///< at the end of the pause with the largest volume, cmH2O
+  std::optional<double> plateau_pressure;   ///< at the end of inspiration if that is the end of a pause, cmH2O
   std::optional<double> pause_resistance;   ///< drop of pressure into that pause over the flow before it, cmH2O s/l
   std::optional<double> static_compliance;  ///< V_T / (plateau - total PEEP at the start), ml/cmH2O
   std::optional<double> dynamic_compliance; ///< V_T / (peak - PEEP), ml/cmH2O
@@ -62,10 +64,10 @@ struct ClinicalEntry {
 /// All numbers of a breath in the order of the table. @p frc: gas volume at rest, ml.
 std::vector<ClinicalEntry> clinical_entries(const ClinicalNumbers &numbers, const std::optional<double> &frc);
 
-/// First and last row of a breath, and the row with its largest volume. The first row is the last one before the
-/// breath.
+/// First and last row of a breath, and the end of its inspiration. The first row is the last one before the breath.
 struct BreathRows {
   std::size_t first, last, fullest;
+  bool complete = true; ///< the run went on to the breath's end
 };
 
 /// The end of a pause: a point of the static pressure-volume curve.
@@ -74,27 +76,61 @@ struct StaticPoint {
   std::string phase; ///< that the pause follows
 };
 
+/// The end of inspiration in rows first ... last, row @p first being the start of the breath: the end of the pause that
+/// holds the largest volume; without one the last row at the largest volume within its phase. Volumes that differ by a
+/// millionth of the tidal volume count as equal, so that rounding chooses nothing. Row @p first if nothing flows in.
+std::size_t end_of_inspiration(const std::vector<SignalRow> &rows, std::size_t first, std::size_t last);
+
 /// The rows of each breath.
 std::vector<BreathRows> breath_rows(const std::vector<SignalRow> &rows);
 
-/// Those of the last breath, or of the whole run without one.
+/// Those that were not cut.
+std::vector<BreathRows> complete_breaths(const std::vector<SignalRow> &rows);
+
+/// The last complete breath, or the whole run without one.
 BreathRows last_breath(const std::vector<SignalRow> &rows);
 
 /// The end of every pause of rows (first, last].
 std::vector<StaticPoint> static_points(const std::vector<SignalRow> &rows, std::size_t first, std::size_t last);
 
 /// Least-squares fit of P - PEEP = E (V - V_start) + R flow with weights dt (Aviles-Rojas & Hurtado 2022, eq. 52)
-/// over rows (first, last]: C_rs = 1/E and R. Leaves both empty where the rows do not define them.
+/// over rows (first, last]: C_rs = 1/E and R. Leaves both empty where the rows do not define them, and R where nothing
+/// resists the flow. @p start: V_start, ml; that of row @p first if not given.
 void fit_single_compartment(const std::vector<SignalRow> &rows, std::size_t first, std::size_t last, double peep,
-                            ClinicalNumbers &numbers);
+                            ClinicalNumbers &numbers, std::optional<double> start = {});
 
 /// Numbers over rows first ... last, row @p first being the start of the breath.
 ClinicalNumbers clinical_numbers(const std::vector<SignalRow> &rows, std::size_t first, std::size_t last);
 
-/// One entry per breath of the rows.
+/// One entry per complete breath.
 std::vector<ClinicalNumbers> breath_numbers(const std::vector<SignalRow> &rows);
 
-/// The last breath's numbers with C_rs, R and time constant fitted over all breaths.
+/// The numbers of the last complete breath. C_rs, R and time constant are fitted over its rows, but with the pressure
+/// and the volume from which the first breath starts: there the lung is at rest, also if later breaths trap gas.
 ClinicalNumbers overall_numbers(const std::vector<SignalRow> &rows);
+
+/// The overall numbers as they are listed; all values are empty if no breath is complete.
+std::vector<ClinicalEntry> overall_entries(const std::vector<SignalRow> &rows, const std::optional<double> &frc);
+
+/// How far the last complete breath is from a steady one.
+struct Unsteadiness {
+  static constexpr double tolerated = 0.01;
+  double change = 0; ///< the largest of the changes looked at, as a share
+  std::string what;  ///< changes by so much
+
+  bool steady() const { return change <= tolerated; }
+};
+
+/// Looks at the trapped volume over the tidal volume and, if there is a complete breath just before it, at the changes
+/// of tidal volume, C_rs and R from that one. Empty if no breath is complete.
+std::optional<Unsteadiness> unsteadiness(const std::vector<SignalRow> &rows);
+
+/// More than this share of the tidal volume is told.
+constexpr double unsettled_tolerated = 0.003;
+
+/// Volume that at least is still to come (or to go) when the first breath starts after other phases, ml: the flow there
+/// is taken to fade as it did in the last step, and a flow that comes to rest never fades faster later. Empty if the
+/// run starts with the breath, or if nothing resists the flow.
+std::optional<double> unsettled_volume(const std::vector<SignalRow> &rows);
 
 } // namespace pulmo

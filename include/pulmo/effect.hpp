@@ -222,12 +222,20 @@ enum class FlowSplit {
   common_pressure ///< so that all patches have one pressure, which is unknown until solved
 };
 
+/// What comes before the first breath where PEEP or a load moves the lung at rest.
+struct Settling {
+  std::shared_ptr<const Programme> programme; ///< the ventilator's with a phase `settle` first; null: that is no matter
+  bool off = false;                           ///< loads that move the lung at rest are counted as breath
+  bool pressure = false;                      ///< so is the pressure that the airway begins with
+};
+
 /// What one effect may know of the scene beside itself.
 struct SceneFacts {
   Elements elements;
   bool airflow = false;                        ///< the pressure field exists
   std::vector<std::string> airway_surfaces;    ///< open to the ventilator
   std::shared_ptr<const Programme> ventilator; ///< null without a ventilator
+  Settling settling;
   FlowSplit flow_split = FlowSplit::uniform;
   std::optional<AirwayResistance> tube; ///< between ventilator and airway
   bool pressure_damping = false;        ///< oscillations of the pressure are damped

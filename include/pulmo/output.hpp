@@ -139,6 +139,9 @@ struct Audits {
   const ErrorReport *errors = nullptr; ///< null before the estimate, or without -error_estimate
 };
 
+/// Why a run with a ventilator has no clinical numbers, if it has none.
+std::string why_no_numbers(const Scene &scene, const std::vector<SignalRow> &rows);
+
 /// Writes summary.json (a finished run) or failure.json (a run that could not go on).
 PetscErrorCode write_summary(const Options &options, const Output &output, const Scene &scene, const Model &model,
                              const Simulation &simulation, const Audits &audits, bool finished);
@@ -147,7 +150,8 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
 PetscErrorCode write_energy(MPI_Comm comm, const Output &output, const Simulation &simulation,
                             const EnergyAudit &audit);
 
-/// Prints the clinical numbers, the energy balance and the regions as tables.
+/// Prints the clinical numbers, the energy balance and the regions as tables, and what keeps the numbers from being
+/// those of a steady breath that starts at rest.
 PetscErrorCode print_numbers(MPI_Comm comm, const Output &output, const Scene &scene, const Simulation &simulation,
                              const Audits &audits);
 

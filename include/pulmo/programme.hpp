@@ -26,6 +26,8 @@ struct Phase {
   PetscReal to = 0;               ///< kPa or mm^3/s
   PetscReal ramp = 0;             ///< s; 0: @p to holds from the first step on
   std::optional<PetscReal> limit; ///< of the ventilator's pressure in a flow phase, kPa: reached, it is held to the end
+  std::optional<PetscReal> dt;    ///< step size, s; not given: -ts_dt
+  std::string where;              ///< file and line that it comes from; empty if from options
 
   /// The controlled quantity at a time of this phase (from must be known if there is a ramp).
   PetscReal value(PetscReal t) const;
@@ -41,6 +43,10 @@ public:
   const std::vector<Phase> &phases() const { return phases_; }
   bool prescribes_flow() const;
   bool limits_pressure() const;
+  /// Whether some phase belongs to a breath.
+  bool breathes() const;
+  /// When the last phase of a breath ends, s.
+  PetscReal end_of_breath(PetscInt breath) const;
 
 private:
   std::vector<Phase> phases_;
@@ -52,6 +58,8 @@ public:
   /// @p value and @p from in cmH2O or ml/s; the other arguments as in Phase.
   Phase &add(const std::string &name, PetscInt breath, PetscReal duration, Control control, PetscReal value,
              PetscReal ramp = 0, std::optional<PetscReal> from = {});
+  /// Appends a phase of another list, its times moved to begin where the last one ends.
+  void append(Phase phase);
   std::vector<Phase> take() { return std::move(phases_); }
 
 private:

@@ -25,13 +25,21 @@ public:
   const Scene &scene() const { return scene_; }
   Model &model() { return model_; }
   Simulation &simulation() { return simulation_; }
+  /// What there is to say of loads that move the lung at rest; empty if there are none.
+  const std::string &settle_note() const { return settle_note_; }
 
 private:
   Options options_;
   Scene scene_;
   Model model_;
   Simulation simulation_;
+  std::string settle_note_;
 };
+
+/// Lets the ventilator begin with a phase `settle` if the scene asks for that where something moves the lung at rest:
+/// prescribed displacements, or forces that do not cancel while nothing is deformed and the gas is at atmospheric
+/// pressure. @p note: what the user is told of it.
+PetscErrorCode settle_under_loads(Scene &scene, Model &model, std::string &note);
 
 /// Refuses a lung, or one of several bodies, that nothing holds in place.
 PetscErrorCode check_held(MPI_Comm comm, const Scene &scene, const Composition &composition);

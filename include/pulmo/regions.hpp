@@ -32,16 +32,17 @@ public:
   double volume(std::size_t region) const { return volumes_[region]; }
   /// State of a region at a row of the signals.
   const RegionState &state(std::size_t row, std::size_t region) const { return rows_[row][region]; }
-  /// What a region took in during a breath, ml.
+  /// What a region took in from the start of a breath to the end of inspiration, ml.
   double ventilation(const BreathRows &breath, std::size_t region) const;
   /// The same as a share of the whole lung's.
   std::optional<double> ventilation_share(const BreathRows &breath, std::size_t region) const;
-  /// The signals with the mean alveolar pressure of the whole lung filled in.
+  /// The signals with what the steps alone do not tell: the mean alveolar pressure of the whole lung, whether anything
+  /// resists the flow, and whether the run ends within a breath.
   std::vector<SignalRow> complete(std::vector<SignalRow> rows) const;
   /// The clinical numbers of a run with these signals.
   std::vector<ClinicalEntry> numbers(const std::vector<SignalRow> &rows) const
   {
-    return clinical_entries(overall_numbers(complete(rows)), scene_.functional_residual_capacity());
+    return overall_entries(complete(rows), scene_.functional_residual_capacity());
   }
 
 private:

@@ -21,6 +21,9 @@ public:
   /// What the active effects put together.
   PetscErrorCode compose(Composition &composition) const;
 
+  /// Lets the ventilator begin with its phase `settle`; before the simulation is set up.
+  void settle_first() { facts_.ventilator = facts_.settling.programme; }
+
   const Mesh &mesh() const { return mesh_; }
   const SceneFacts &facts() const { return facts_; }
   const Tissue &tissue() const { return *tissue_; }

@@ -12,6 +12,8 @@
 #include "pulmo/step_control.hpp"
 #include "pulmo/stop_signal.hpp"
 
+#include <set>
+
 namespace pulmo {
 
 /// What an observer sees after each accepted step (and once at the start).
@@ -130,6 +132,12 @@ private:
   PetscErrorCode fail(PetscReal dt, const std::string &reason, PetscInt newton, const Measures &measures, bool inverted,
                       bool retry);
   PetscErrorCode warn_of_faint_load(SNES snes);
+  /// Says so, once for each line of a programme, if a phase that begins at @p pressure (cmH2O) has a lower limit.
+  PetscErrorCode warn_of_low_limit(const Phase &phase, PetscReal pressure);
+  /// The same before the run for all phases whose first pressure is known by then.
+  PetscErrorCode warn_of_low_limits();
+  /// Step size asked for in the phase at hand (before the run: in its first), s.
+  PetscReal asked_dt() const { return (phase_ ? *phase_ : phases_.front()).dt.value_or(wanted_dt_); }
   /// Notes an attempt that failed; ends the run if the next one would be too short.
   PetscErrorCode reject(PetscReal dt, const std::string &reason, PetscInt newton, const Measures &measures,
                         bool inverted);
@@ -152,8 +160,9 @@ private:
   VecHandle state_, local_, rate_, local_residual_, before_;
   VecHandle border_x_, border_b_, border_z_, border_r_, border_y_; ///< global; the last one local
   std::vector<Phase> phases_;
+  std::set<std::string> low_limits_; ///< lines of the programme that were warned of
   const Phase *phase_ = nullptr;
-  PetscReal wanted_dt_ = 0.05, dt_ = 0.05; ///< asked for; in use before any shortening to land on a time
+  PetscReal wanted_dt_ = 0.05, dt_ = 0.05; ///< -ts_dt; in use before any shortening to land on a time
   PetscReal next_dt_ = 0;                  ///< size of the step after the last accepted one, before any cut
   PetscReal end_ = 0;
   SignalRow accepted_;

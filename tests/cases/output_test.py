@@ -26,6 +26,7 @@ BREATHING = ["-ventilator_pip", PIP, "-ventilator_peep", PEEP, "-ventilator_insp
 # numbers of a breath that need the fields (audit_test.py)
 NUMBERS_OF_FIELDS = {"auto_peep_cmH2O", "total_peep_cmH2O", "static_compliance_ml_per_cmH2O", "energy_j",
                      "inspiratory_energy_j"}
+EXTENT = {"complete", "start_s", "end_of_inspiration_s", "end_s"}
 # slow enough to leave some gas behind
 GAS = ["-airflow_permeability", "300"]
 
@@ -80,11 +81,11 @@ def jacobians(x, u, cells):
     return volume, integral, least
 
 
-def fit(rows, peep):
-    """C_rs (ml/cmH2O) and R (cmH2O s/l) by numpy's least squares over rows (time, P, V, flow, dt)."""
+def fit(rows, peep, start=None):
+    """C_rs (ml/cmH2O) and R (cmH2O s/l) by numpy's least squares over rows (time, P, V, flow, dt); start: V_0."""
     P, V, Q, dt = (rows[c] for c in ("airway_pressure_cmH2O", "volume_ml", "flow_ml_per_s", "dt_s"))
     w = np.sqrt(dt[1:])
-    A = np.column_stack([(V[1:] - V[0]) * w, Q[1:] * w])
+    A = np.column_stack([(V[1:] - (V[0] if start is None else start)) * w, Q[1:] * w])
     (E, R), *_ = np.linalg.lstsq(A, (P[1:] - peep) * w, rcond=None)
     return 1 / E, 1000 * R
 
@@ -168,9 +169,10 @@ class Breaths(unittest.TestCase):
         self.assertLessEqual(np.abs(V - np.cumsum(dt * Q)).max(), 1e-9 * reference)
         self.assertGreater(V.max(), 0.1 * reference)
 
-    def test_fit_over_all_breaths(self):
-        first, last = self.breaths[0][0], self.breaths[-1][1]
-        C, R = fit(cut(self.rows, first, last), PEEP)
+    def test_overall_fit(self):
+        """Over the last breath's rows, with the volume above the first breath's start."""
+        first, last = self.breaths[-1]
+        C, R = fit(cut(self.rows, first, last), PEEP, self.rows["volume_ml"][self.breaths[0][0]])
         self.assertAlmostEqual(self.summary["compliance_ml_per_cmH2O"] / C, 1, places=9)
         self.assertAlmostEqual(self.summary["resistance_cmH2O_s_per_l"] / R, 1, places=9)
         self.assertAlmostEqual(self.summary["time_constant_s"] / (C * R / 1000), 1, places=9)
@@ -192,14 +194,18 @@ class Breaths(unittest.TestCase):
                 "peak_expiratory_flow_ml_per_s": -Q[1:].min(),
                 "dynamic_compliance_ml_per_cmH2O": (V.max() - V[0]) / (PIP - PEEP), "strain": (V.max() - V[0]) / 0.99,
                 "pause_resistance_cmH2O_s_per_l": None, "static_curve_compliance_ml_per_cmH2O": None}
-            self.assertEqual(set(n), set(expected) | NUMBERS_OF_FIELDS)
+            self.assertEqual(set(n), set(expected) | NUMBERS_OF_FIELDS | EXTENT)
+            self.assertIs(n["complete"], True)
+            np.testing.assert_allclose([n["start_s"], n["end_s"]], rows["time_s"][[0, -1]], rtol=1e-14)
+            pause = [t for t, name in zip(rows["time_s"], rows["phase"]) if name == "pause"]
+            self.assertAlmostEqual(n["end_of_inspiration_s"], pause[-1], places=12)
             for name, value in expected.items():
                 if value is None:
                     self.assertIsNone(n[name], name)
                 else:
                     self.assertAlmostEqual(n[name], value, delta=1e-9 * max(1, abs(value)), msg=name)
         last = self.summary["breaths"][-1]
-        for name in set(last) - {"compliance_ml_per_cmH2O", "resistance_cmH2O_s_per_l", "time_constant_s",
+        for name in set(last) - EXTENT - {"compliance_ml_per_cmH2O", "resistance_cmH2O_s_per_l", "time_constant_s",
                                  "energy_j", "inspiratory_energy_j"}:
             self.assertEqual(self.summary[name], last[name], name)
         self.assertGreater(abs(self.summary["breaths"][0]["trapped_volume_ml"]), 1e-6)

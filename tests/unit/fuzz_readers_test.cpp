@@ -136,8 +136,8 @@ bool taken(Read read, const std::string &input)
 TEST(Fuzz, Programmes)
 {
   const std::string seed = "# a comment\nsettle 1 pressure 5 ramp 0.5\n\nrepeat 2   # breaths\n"
-                           "  inspiration 0.8 flow 200 from 800 ramp 0.8 limit 25\n  pause 0.2 hold\n"
-                           "  repeat 3\n    expiration 0.5 pressure 5\n  end\nend\nsigh 2 pressure 30 ramp 1\n";
+                           "  inspiration 0.8 flow 200 from 800 ramp 0.8 limit 25\n  pause 0.2 hold dt 0.1\n"
+                           "  repeat 3\n    expiration 0.5 pressure 5\n  end\nend\nsigh 2 pressure 30 ramp 1 breath\n";
   Mutation mutation(1);
   int read = 0;
   const int n = rounds(2000);

@@ -4,7 +4,9 @@
 #include "pulmo/effects/ventilator.hpp"
 #include "pulmo/units.hpp"
 
+#include <fstream>
 #include <random>
+#include <unistd.h>
 
 namespace pulmo::test {
 namespace {
@@ -184,6 +186,102 @@ TEST(ProgrammeFile, PhasesRepeatsAndBreaths)
   EXPECT_NEAR(p[11].end, 1 + 2 * 2.5 + 2, 1e-12);
 }
 
+TEST(ProgrammeFile, AnyPhaseMayBeginABreathAndHaveItsOwnSteps)
+{
+  const auto p = parse("rise 1 pressure 5 ramp 1 breath\n"
+                       "fall 1 pressure 0 dt 0.02\n"
+                       "rise 1 flow 100 dt 0.2 breath limit 9\n"
+                       "closed 1 hold dt 0.5\n"
+                       "inspiration 1 pressure 5 breath\n"
+                       "hold_it 1 hold breath\n");
+  const PetscInt breaths[] = {1, 1, 2, 2, 3, 4};
+  for (std::size_t i = 0; i < 6; ++i) EXPECT_EQ(p[i].breath, breaths[i]) << i;
+  EXPECT_FALSE(p[0].dt);
+  EXPECT_DOUBLE_EQ(*p[1].dt, 0.02);
+  EXPECT_DOUBLE_EQ(*p[2].dt, 0.2);
+  EXPECT_NEAR(*p[2].limit, 9 * k, 1e-15);
+  EXPECT_DOUBLE_EQ(*p[3].dt, 0.5);
+  EXPECT_EQ(p[3].where, "file:4");
+  const Programme programme(p);
+  EXPECT_TRUE(programme.breathes());
+  EXPECT_DOUBLE_EQ(programme.end_of_breath(2), 4);
+  EXPECT_FALSE(Programme(parse("step 1 pressure 5\nstep 1 pressure 0\n")).breathes());
+}
+
+/// The ventilator with phases of a file; what it does if a load moves the lung at rest.
+SceneFacts facts_of(const std::string &text, const std::string &more = "")
+{
+  const std::string file = testing::TempDir() + "pulmo_programme_" + std::to_string(getpid()) + ".txt";
+  std::ofstream(file) << text;
+  Ventilator ventilator;
+  Options options(PETSC_COMM_WORLD);
+  SceneFacts facts;
+  EXPECT_EQ(static_cast<int>(set_options("-ventilator programme -ventilator_programme " + file + " " + more)), 0);
+  EXPECT_EQ(static_cast<int>(ventilator.declare(options)), 0);
+  EXPECT_EQ(static_cast<int>(ventilator.announce(facts)), 0);
+  std::remove(file.c_str());
+  return facts;
+}
+
+TEST(Settling, ComesBeforeAProgrammeThatBeginsWithABreath)
+{
+  const char *breath = "inspiration 1 pressure 9 ramp 0.1\nexpiration 2 pressure 0 dt 0.2\n";
+  SceneFacts facts = facts_of(breath);
+  ASSERT_EQ(facts.ventilator->phases().size(), 2u) << "nothing comes first unless a load asks for it";
+  ASSERT_TRUE(facts.settling.programme);
+  const auto &p = facts.settling.programme->phases();
+  ASSERT_EQ(p.size(), 3u);
+  expect_chain(p);
+  EXPECT_EQ(p[0].name, "settle");
+  EXPECT_EQ(p[0].breath, 0);
+  EXPECT_DOUBLE_EQ(p[0].end, 2);
+  EXPECT_EQ(p[0].to, 0);
+  EXPECT_EQ(p[1].breath, 1);
+  EXPECT_DOUBLE_EQ(p[1].end, 3);
+  EXPECT_DOUBLE_EQ(*p[2].dt, 0.2);
+  EXPECT_DOUBLE_EQ(p[2].end, 5);
+
+  EXPECT_DOUBLE_EQ(facts_of(breath, "-ventilator_settle_duration 7").settling.programme->phases()[0].end, 7);
+  EXPECT_DOUBLE_EQ(*facts_of(breath, "-ventilator_dt_scale 4").ventilator->phases()[1].dt, 0.8);
+  facts = facts_of(breath, "-ventilator_settle off");
+  EXPECT_TRUE(facts.settling.off);
+  EXPECT_FALSE(facts.settling.programme);
+  EXPECT_EQ(facts.ventilator->phases().size(), 2u);
+  facts = facts_of(breath, "-ventilator_settle on");
+  EXPECT_FALSE(facts.settling.programme);
+  EXPECT_EQ(facts.ventilator->phases()[0].name, "settle");
+  // phases before the first breath are a settling of the user's own
+  EXPECT_FALSE(facts_of(std::string("wait 1 pressure 0\n") + breath).settling.programme);
+  EXPECT_FALSE(facts_of("step 1 pressure 5\n").settling.programme);
+  // an airway that begins with a pressure inflates the lung at rest, as PEEP does
+  facts = facts_of("inspiration 1 pressure 9 from 5 ramp 0.1\nexpiration 2 pressure 5\n");
+  ASSERT_EQ(facts.ventilator->phases().size(), 3u);
+  EXPECT_NEAR(facts.ventilator->phases()[0].to, 5 * k, 1e-15);
+}
+
+TEST(Settling, OfTheOtherModes)
+{
+  for (const char *mode : {"pcv", "vcv -ventilator_ramp 0.1", "supersyringe"}) {
+    Ventilator ventilator;
+    Options options(PETSC_COMM_WORLD);
+    SceneFacts facts;
+    EXPECT_EQ(static_cast<int>(set_options(std::string("-ventilator ") + mode)), 0);
+    EXPECT_EQ(static_cast<int>(ventilator.declare(options)), 0);
+    EXPECT_EQ(static_cast<int>(ventilator.announce(facts)), 0);
+    EXPECT_EQ(facts.ventilator->phases()[0].breath, 1) << mode;
+    ASSERT_TRUE(facts.settling.programme) << mode;
+    const auto &p = facts.settling.programme->phases();
+    expect_chain(p);
+    EXPECT_EQ(p.size(), facts.ventilator->phases().size() + 1) << mode;
+    EXPECT_EQ(p[0].name, "settle") << mode;
+    EXPECT_NEAR(p[0].end, std::string(mode) == "supersyringe" ? 2 : 2.1, 1e-12) << mode;
+  }
+  EXPECT_EQ(phases_of("pcv -ventilator_peep 5 -ventilator_pip 15")[0].name, "settle");
+  EXPECT_EQ(phases_of("pcv -ventilator_peep 5 -ventilator_pip 15 -ventilator_settle off")[0].name, "settle");
+  EXPECT_DOUBLE_EQ(phases_of("pcv -ventilator_peep 5 -ventilator_pip 15 -ventilator_settle_duration 9")[0].end, 9);
+  EXPECT_EQ(phases_of("vcv -ventilator_settle on")[0].name, "settle");
+}
+
 /// What the reader says of a file that it refuses.
 std::string complaint(const std::string &text)
 {
@@ -213,7 +311,12 @@ TEST(ProgrammeFile, ErrorsNameFileLineAndMend)
       {"inspiration 1 pressure 5 ramp 2\n", "must lie between 0 and the duration"},
       {"inspiration 1 pressure 5 from 2\n", "'from' is the start of a ramp"},
       {"inspiration 1 pressure 5 limit 20\n", "'limit' does not belong to a pressure phase"},
-      {"pause 1 hold 5\n", "'5' does not belong to a hold phase; hold takes nothing more"},
+      {"pause 1 hold 5\n", "'5' does not belong to a hold phase; it may have 'dt' and 'breath'"},
+      {"pause 1 hold ramp 0.5\n", "'ramp' does not belong to a hold phase"},
+      {"inspiration 1 pressure 5 breath breath\n", "'breath' is given twice"},
+      {"inspiration 1 pressure 5 dt\n", "'dt' needs a number"},
+      {"inspiration 1 pressure 5 dt 0\n", "file:1: 'dt' must be positive, at least 1e-06 s"},
+      {"inspiration 1 pressure 5 dt 0.1 dt 0.1\n", "'dt' is given twice"},
       {"inspiration 1 pressure 5 ramp 0.1 ramp 0.5\n", "'ramp' is given twice"},
       {"inspiration 0x1 pressure 5\n", "must be a number, not '0x1'"},
       {"inspiration 1e-15 pressure 5\n", "must be positive, at least"},

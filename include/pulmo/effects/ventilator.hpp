@@ -82,6 +82,16 @@ public:
                             breaths_));
     options.group(name(), "programme", mode_ == "programme", "-ventilator programme");
     PetscCall(options.text("programme", "file of phases (docs/ventilator.md)", file_));
+    PetscCall(options.real("dt_scale", "-", Range::positive(), "factor of each 'dt' in that file", dt_scale_));
+    options.group(name(), "settling", active(), "-ventilator pcv, vcv, supersyringe or programme");
+    PetscCall(options.choice("settle", {"auto", "on", "off"},
+                             "whether a phase 'settle', which is no breath, comes before the first one: auto: where "
+                             "PEEP or a load moves the lung at rest; off: for PEEP only",
+                             settle_));
+    if (pcv || vcv) settle_duration_ = ramp_ + expiration_;
+    PetscCall(options.real("settle_duration", "s", Range::positive(),
+                           "duration of that phase (default: pcv and vcv ramp + expiration, else 2)",
+                           settle_duration_));
     options.group(name(), "prescribed flow", active() && !pcv, "-ventilator vcv, supersyringe or programme");
     PetscCall(options.choice(
         "flow_split", {"uniform", "common_pressure"},
@@ -93,6 +103,8 @@ public:
           !file_.empty(), options.comm(),
           "-ventilator programme needs -ventilator_programme FILE (docs/ventilator.md shows how to write it)");
       PetscCall(read_programme(options.comm(), "-ventilator_programme", file_, read_));
+      for (Phase &phase : read_)
+        if (phase.dt) *phase.dt *= dt_scale_;
     }
     PetscFunctionReturn(PETSC_SUCCESS);
   }
@@ -100,6 +112,10 @@ public:
   PetscErrorCode announce(SceneFacts &facts) override
   {
     facts.ventilator = std::make_shared<Programme>(programme());
+    facts.settling.off = settle_ == "off" && begins_with_breath() && !settles();
+    facts.settling.pressure = starting_pressure() != 0;
+    if (settle_ == "auto" && begins_with_breath() && !settles())
+      facts.settling.programme = std::make_shared<Programme>(programme(true));
     facts.flow_split = split_ == "uniform" ? FlowSplit::uniform : FlowSplit::common_pressure;
     return PETSC_SUCCESS;
   }
@@ -123,12 +139,36 @@ public:
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
-  /// The phases. With PEEP first `settle` (0 -> PEEP).
-  Programme programme() const
+  /// The phases, as far as they do not hang on what loads do at rest.
+  Programme programme() const { return programme(settles()); }
+
+private:
+  /// Whether a phase `settle` comes first whatever loads do at rest.
+  bool settles() const
   {
-    if (mode_ == "programme") return Programme(read_);
+    if (settle_ == "on") return true;
+    // off leaves PEEP its own: that is no load, and a breath that includes it is of no use
+    return (settle_ == "auto" || mode_ != "programme") && begins_with_breath() && starting_pressure() != 0;
+  }
+  /// Phases before the first breath are a settling of the user's own.
+  bool begins_with_breath() const { return mode_ != "programme" || read_.front().breath > 0; }
+  /// The pressure that the airway has when the first breath begins, cmH2O.
+  PetscReal starting_pressure() const
+  {
+    if (mode_ != "programme") return mode_ == "supersyringe" ? 0 : peep_;
+    const Phase &first = read_.front();
+    return first.control == Control::pressure ? first.from.value_or(0) / units::kPa_per_cmH2O : 0;
+  }
+
+  Programme programme(bool settle) const
+  {
     ProgrammeBuilder b;
-    for (PetscInt breath = 1; breath <= breaths_; ++breath) {
+    if (settle)
+      b.add("settle", 0, settle_duration_, Control::pressure, starting_pressure(),
+            mode_ != "programme" && peep_ != 0 ? ramp_ : 0);
+    if (mode_ == "programme")
+      for (const Phase &phase : read_) b.append(phase);
+    for (PetscInt breath = 1; mode_ != "programme" && breath <= breaths_; ++breath) {
       if (mode_ == "supersyringe") {
         const PetscReal flow = step_volume_ / inspiration_;
         for (PetscInt step = 0; step < 2 * steps_; ++step) {
@@ -138,7 +178,6 @@ public:
         }
         continue;
       }
-      if (breath == 1 && peep_ != 0) b.add("settle", 0, ramp_ + expiration_, Control::pressure, peep_, ramp_);
       const bool vcv = mode_ == "vcv";
       if (vcv) // a ramp takes half its length from the plateau of flow
         b.add("inspiration", breath, inspiration_, Control::flow, tidal_volume_ / (inspiration_ - ramp_ / 2), ramp_);
@@ -150,7 +189,6 @@ public:
     return Programme(b.take());
   }
 
-private:
   /// Settings that contradict one another.
   PetscErrorCode check_settings(const Options &options) const
   {
@@ -165,15 +203,21 @@ private:
     PulmoUserCheck(ramp_down_ <= expiration_, options.comm(),
                    "-ventilator_ramp_down %g s is longer than -ventilator_expiration %g s; shorten the ramp",
                    (double)ramp_down_, (double)expiration_);
+    PulmoUserCheck(
+        peep_ == 0 || ramp_ <= settle_duration_, options.comm(),
+        "-ventilator_settle_duration %g s is shorter than -ventilator_ramp %g s, in which the pressure rises "
+        "to PEEP; give a longer one",
+        (double)settle_duration_, (double)ramp_);
     PulmoUserCheck(mode_ == "vcv" || pip_ >= peep_, options.comm(),
                    "-ventilator_pip %g cmH2O is below -ventilator_peep %g cmH2O; raise pip or lower peep", (double)pip_,
                    (double)peep_);
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
-  std::string mode_ = "off", file_, split_ = "uniform";
+  std::string mode_ = "off", file_, split_ = "uniform", settle_ = "auto";
   PetscReal pip_ = 6, peep_ = 0, tidal_volume_ = 500, step_volume_ = 100;
   PetscReal inspiration_ = 1, pause_ = 0, expiration_ = 2, ramp_ = 0.1, ramp_down_ = 0;
+  PetscReal settle_duration_ = 2, dt_scale_ = 1;
   PetscInt breaths_ = 1, steps_ = 8;
   std::vector<Phase> read_;
 };
