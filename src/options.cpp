@@ -256,6 +256,31 @@ PetscErrorCode Options::vector(const std::string &name, const std::string &unit,
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+void Options::tolerate(const std::string &name)
+{
+  for (Declared &d : declared_) d.tolerated = d.tolerated || d.name == full(name);
+}
+
+void Options::settle(const std::string &name, const std::string &group, const std::vector<std::string> &value)
+{
+  for (Declared &d : declared_)
+    if (d.name == "-" + group + "_" + name) {
+      d.used = join(value, ",");
+      d.settled = true;
+    }
+}
+
+void Options::turn_off(const std::string &group)
+{
+  for (Declared &d : declared_)
+    if (d.name == "-" + group) {
+      d.used = "off";
+      d.settled = true;
+    }
+  for (Group &g : groups_)
+    if (g.name == group && !g.enabled_by.empty()) g.in_use = false;
+}
+
 std::string Options::nearest(const std::string &name, std::size_t most) const
 {
   std::string best;
@@ -367,7 +392,7 @@ PetscErrorCode Options::check_unknown() const
     bool in_use = false;
     for (const Declared &d : declared_) {
       if (d.name != name) continue;
-      if (groups_[d.group].in_use)
+      if (groups_[d.group].in_use || d.tolerated)
         in_use = true;
       else
         idle = &d;
@@ -428,6 +453,14 @@ PetscErrorCode Options::print_help() const
   }
   PetscCall(PetscPrintf(comm_, "\nExit code: 0 finished, 1 wrong input, 2 could not go on, 3 stopped by a signal and "
                                "there is a checkpoint to go on from (docs/running.md)\n"));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Options::print_settled() const
+{
+  PetscFunctionBeginUser;
+  for (const Declared &d : declared_)
+    if (d.settled) PetscCall(PetscPrintf(comm_, "pulmo: in this scene %s is %s\n", d.name.c_str(), d.used.c_str()));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

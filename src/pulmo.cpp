@@ -185,6 +185,10 @@ PetscErrorCode check_held(MPI_Comm comm, const Scene &scene, const Composition &
         surfaces,
         "is held in place by nothing: name a surface of it with -chest_wall_surfaces or -support_surfaces, or "
         "join the bodies in gmsh"));
+  const std::vector<std::string> walls = composition.surfaces_of("lumen_pressure"),
+                                 bearing = composition.bearing_surfaces();
+  if (!walls.empty() && std::find(bearing.begin(), bearing.end(), "") == bearing.end())
+    PetscCall(check_wall_load(scene.mesh(), walls, bearing));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -264,6 +268,7 @@ PetscErrorCode run(const Registry &registry, bool &finished)
   if (help) PetscCall(options.print_help());
   if (!help || has_mesh) PetscCall(run.setup()); // with -help PETSc lists what it reads for this scene
   if (help) {
+    if (has_mesh) PetscCall(options.print_settled());
     finished = true;
     PetscFunctionReturn(PETSC_SUCCESS);
   }

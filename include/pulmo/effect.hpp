@@ -178,6 +178,25 @@ public:
     return list;
   }
 
+  /// The same without pins at single vertices, which bear no load.
+  std::vector<std::string> bearing_surfaces() const
+  {
+    std::vector<std::string> list;
+    for (const Constraint &c : constraints_)
+      if (c.field == displacement && !c.surface.empty()) list.push_back(c.surface);
+    for (const Term &t : terms_)
+      if (resists(t)) list.push_back(t.surface);
+    return list;
+  }
+  /// The surfaces on which an effect has terms.
+  std::vector<std::string> surfaces_of(const std::string &effect) const
+  {
+    std::vector<std::string> list;
+    for (const Term &t : terms_)
+      if (t.effect == effect && !t.surface.empty()) list.push_back(t.surface);
+    return list;
+  }
+
   const std::vector<FieldSpec> &fields() const { return fields_; }
   const std::vector<Term> &terms() const { return terms_; }
   const std::vector<Constraint> &constraints() const { return constraints_; }
@@ -185,6 +204,8 @@ public:
   const std::vector<ParameterBlock> &parameter_blocks() const { return parameters_; }
 
 private:
+  /// Whether a term resists displacement itself.
+  static bool resists(const Term &t) { return t.test == displacement && t.trial == displacement && (t.g0 || t.bd_g0); }
   Term term(const std::string &name, const std::string &surface, PetscInt test, PetscInt trial) const
   {
     Term t;
@@ -218,6 +239,7 @@ struct AirwayResistance {
 
 /// How the flow of a flow phase is shared by the airway patches.
 enum class FlowSplit {
+  automatic,      ///< not said: uniform where the airway is one patch, else common_pressure (Scene::prepare)
   uniform,        ///< the same flux through every element of area (Aviles-Rojas & Hurtado 2022, eq. 45)
   common_pressure ///< so that all patches have one pressure, which is unknown until solved
 };
@@ -233,10 +255,10 @@ struct Settling {
 struct SceneFacts {
   Elements elements;
   bool airflow = false;                        ///< the pressure field exists
-  std::vector<std::string> airway_surfaces;    ///< open to the ventilator
+  std::vector<std::string> airway_surfaces;    ///< open to the ventilator; without airflow those that would be
   std::shared_ptr<const Programme> ventilator; ///< null without a ventilator
   Settling settling;
-  FlowSplit flow_split = FlowSplit::uniform;
+  FlowSplit flow_split = FlowSplit::automatic;
   std::optional<AirwayResistance> tube; ///< between ventilator and airway
   bool pressure_damping = false;        ///< oscillations of the pressure are damped
 
@@ -267,6 +289,9 @@ public:
   virtual bool active() const = 0;
   /// Tells the other effects what they may need to know.
   virtual PetscErrorCode announce(SceneFacts &) { return PETSC_SUCCESS; }
+  /// For an effect that is on by default where others are: they have announced themselves, the mesh is read, active()
+  /// is asked next.
+  virtual PetscErrorCode consider(Options &, const Mesh &, const SceneFacts &) { return PETSC_SUCCESS; }
   /// Checks against the mesh and the other effects; errors name the option and how to fix it.
   virtual PetscErrorCode check(const Options &, const Mesh &, const SceneFacts &) { return PETSC_SUCCESS; }
   /// Adds its fields.

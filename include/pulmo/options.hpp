@@ -63,6 +63,13 @@ public:
   /// Whether the user gave `-<group>_<name>` of the current group.
   PetscErrorCode given(const std::string &name, bool &is_given) const;
 
+  /// Lets option @p name of the current group be given where it has no effect.
+  void tolerate(const std::string &name);
+  /// Notes what an option of effect @p group that was left open came to; it counts as used with that value.
+  void settle(const std::string &name, const std::string &group, const std::vector<std::string> &value);
+  /// An effect that is on by default turned out to have nothing to do in this scene: as if it had been given as off.
+  void turn_off(const std::string &group);
+
   /// Ends with a user error if the database holds a name under one of pulmo's prefixes that nothing declared, or one
   /// of an effect that is not in use (unless that effect was turned off by `-<effect> off`).
   /// So does a name outside these prefixes that is an option of pulmo's but for a letter or two, or for its prefix.
@@ -74,6 +81,8 @@ public:
   PetscErrorCode warn_unused() const;
   /// Prints every declared option (the part of -help that is pulmo's own).
   PetscErrorCode print_help() const;
+  /// Prints what the options that were left open came to (settle(), turn_off()).
+  PetscErrorCode print_settled() const;
   /// Name and value of each option in the database.
   PetscErrorCode all_given(OptionList &list) const;
   /// Name and value of every option that the run used: pulmo's own of what is in use, defaults included, and PETSc's
@@ -91,6 +100,8 @@ private:
     std::string name, value, unit, range, help; ///< value: the default
     std::string used;                           ///< as given, or the default
     std::size_t group;
+    bool tolerated = false; ///< may be given where its group is not in use
+    bool settled = false;   ///< left open, and decided by the scene
   };
   struct Group {
     std::string name, about, enabled_by;

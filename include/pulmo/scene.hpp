@@ -6,6 +6,7 @@
 #include "pulmo/effects/tissue.hpp"
 #include "pulmo/effects/ventilator.hpp"
 #include "pulmo/mesh.hpp"
+#include "pulmo/openings.hpp"
 #include "pulmo/registry.hpp"
 
 namespace pulmo {
@@ -17,7 +18,7 @@ public:
   /// Declares the options of every effect and of the mesh.
   PetscErrorCode declare(Options &options);
   /// Reads the mesh and checks every active effect against it.
-  PetscErrorCode prepare(const Options &options);
+  PetscErrorCode prepare(Options &options);
   /// What the active effects put together.
   PetscErrorCode compose(Composition &composition) const;
 
@@ -26,6 +27,8 @@ public:
 
   const Mesh &mesh() const { return mesh_; }
   const SceneFacts &facts() const { return facts_; }
+  /// The airway, where it lets air flow that a ventilator prescribes.
+  const std::optional<Openings> &openings() const { return openings_; }
   const Tissue &tissue() const { return *tissue_; }
   const Airflow &airflow() const { return *airflow_; }
   /// Gas volume at rest Phi0 V0, ml; empty without airflow, where no porosity is given.
@@ -34,8 +37,11 @@ public:
   std::vector<const Effect *> active() const;
 
 private:
+  PetscErrorCode share_flow(Options &options);
+
   Mesh mesh_;
   SceneFacts facts_;
+  std::optional<Openings> openings_;
   std::vector<std::unique_ptr<Effect>> effects_;
   Tissue *tissue_; // these two are elements of effects_
   Airflow *airflow_;

@@ -20,7 +20,7 @@ from accuracy import (command, elements, extrapolate, fields, ladder, manufactur
                       sphere, truth)
 from accuracy.errors import Axes, estimate  # noqa: E402
 
-SCENE = ["-mesh_scale", "100", "-airflow_surfaces", "x1", "-chest_wall_surfaces", "x0,x1,y0,y1,z0,z1", "-ventilator_inspiration", "0.4",
+SCENE = [*pulmo.PAPER, "-mesh_scale", "100", "-airflow_surfaces", "x1", "-chest_wall_surfaces", "x0,x1,y0,y1,z0,z1", "-ventilator_inspiration", "0.4",
          "-ventilator_ramp_down", "0.1", "-ventilator_expiration", "0.4"]
 
 

@@ -8,7 +8,7 @@ import unittest
 import pulmo_case as pc
 
 # a block of 1000 ml, 24 cells, one face airway; a breath whose pressure rises and falls over 0.2 s
-SCENE = (pc.BLOCK + pc.DIRECT + pc.QUIET +
+SCENE = (pc.BLOCK + pc.DIRECT + pc.QUIET + pc.PAPER +
          ["-tissue", "yoshihara", "-airflow", "-airflow_permeability", "100", "-airflow_surfaces", "x1", "-chest_wall",
           "-chest_wall_surfaces", "x0,y0,y1,z0,z1", "-ventilator", "pcv", "-ventilator_pip", "8", "-ventilator_inspiration", "0.8",
           "-ventilator_expiration", "0.8", "-ventilator_ramp", "0.2", "-ventilator_ramp_down", "0.2", "-energy_audit", "off"])

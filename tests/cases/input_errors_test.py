@@ -405,7 +405,9 @@ def table(m):
                                      ["-ventilator_peep", "no effect", "-ventilator pcv or vcv"]),
         "inspiration of a programme": (file_of("fine.txt", b"a 1 hold\n") + ["-ventilator_inspiration", "1"],
                                        ["-ventilator_inspiration", "no effect"]),
-        "a split of no flow": (good + ["-ventilator_flow_split", "uniform"], ["-ventilator_flow_split", "no effect"]),
+        "gas on the wall of a lung that only pins hold": (
+            lung + pulmo.PINS + ["-chest_wall", "off", "-ventilator", "pcv"],
+            ["there is no equilibrium", "-support_rigid", "-lumen_pressure off", "-chest_wall", "-support_surfaces"]),
         "unknown split": (lung + ["-ventilator", "vcv", "-ventilator_flow_split", "fair"],
                           ["-ventilator_flow_split", "'fair'", "uniform", "common_pressure"]),
         "no tidal volume": (lung + ["-ventilator", "vcv", "-ventilator_tidal_volume", "0"],

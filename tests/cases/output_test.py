@@ -355,7 +355,7 @@ class Breaths(unittest.TestCase):
 class OtherScenes(unittest.TestCase):
     def test_without_airflow(self):
         """No pressure field and nothing that derives from it."""
-        case = pulmo.finished(pulmo.TIGHT + pulmo.CUBE + [
+        case = pulmo.finished(pulmo.TIGHT + pulmo.CUBE + pulmo.PAPER + [
             "-chest_wall", "-ventilator", "pcv", "-ventilator_inspiration", "0.3", "-ventilator_expiration", "0.3",
             "-effects_view"])
         self.assertEqual(case.columns(), COLUMNS)  # the flow of a ventilated scene is the change of volume

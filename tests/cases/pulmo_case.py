@@ -38,8 +38,9 @@ def options_file(name):
 
 TIGHT = options_file("solvers/tight.opts")
 DIRECT = options_file("solvers/direct.opts")
-PCV = options_file("scenes/pcv.opts")
-VCV = options_file("scenes/vcv.opts")
+PAPER = options_file("scenes/paper.opts")  # the paper's readings: no gas on the airway wall, flow shared by area
+PCV = options_file("scenes/pcv.opts") + PAPER
+VCV = options_file("scenes/vcv.opts") + PAPER
 CUBE = ["-dm_plex_filename", mesh("cube_lung.msh"), "-mesh_scale", "1"]
 LUNG = ["-dm_plex_filename", mesh("lung_test.msh")]
 LITRE = ["-dm_plex_filename", mesh("cube_lung.msh"), "-mesh_scale", "10"]  # a cube of 1000 ml, one face airway
@@ -48,7 +49,7 @@ BLOCK = ["-dm_plex_filename", mesh("cube_coarse.msh"), "-mesh_scale", "100"]  # 
 PINS = ["-support", "-support_rigid"]
 ROLLERS = ["-support", "-support_surfaces", "x0,y0,z0", "-support_components_x0", "x", "-support_components_y0", "y",
            "-support_components_z0", "z"]
-SCENE = ["-tissue", "birzle", "-airflow", "-airflow_permeability", "1e4", "-chest_wall"]  # all but a ventilator
+SCENE = PAPER + ["-tissue", "birzle", "-airflow", "-airflow_permeability", "1e4", "-chest_wall"]  # all but a ventilator
 STILL = ["-airflow", "off"]
 UNIFORM, COMMON = ["-ventilator_flow_split", "uniform"], ["-ventilator_flow_split", "common_pressure"]
 # 40 ml into case_meshes.bodies, a pause in which they exchange gas

@@ -25,7 +25,7 @@ SCENES = {
 
 
 def run(solver, options, ranks=1):
-    return pc.finished(pc.options_file(f"solvers/{solver}") + pc.LUNG + options, ranks=ranks)
+    return pc.finished(pc.options_file(f"solvers/{solver}") + pc.LUNG + pc.PAPER + options, ranks=ranks)
 
 
 def solver_files():

@@ -10,7 +10,7 @@ import numpy as np
 import pulmo_case as pulmo
 
 DT = 0.05
-SUPERSYRINGE = pulmo.options_file("scenes/supersyringe.opts")
+SUPERSYRINGE = pulmo.options_file("scenes/supersyringe.opts") + pulmo.PAPER
 
 
 class Delivery(unittest.TestCase):
@@ -202,7 +202,7 @@ class Programmes(unittest.TestCase):
 
     def test_without_a_breath(self):
         """A programme without `inspiration` has no numbers of a breath, but its static curve."""
-        case = pulmo.finished(pulmo.options_file("scenes/programme.opts") + pulmo.DIRECT + pulmo.CUBE +
+        case = pulmo.finished(pulmo.options_file("scenes/programme.opts") + pulmo.PAPER + pulmo.DIRECT + pulmo.CUBE +
                               pulmo.programme("inflation 0.1 flow 0.05\npause 0.1 hold\n"))
         numbers = case.json()
         for key in ("peak_inspiratory_pressure_cmH2O", "tidal_volume_ml", "work_j", "compliance_ml_per_cmH2O"):
@@ -212,7 +212,7 @@ class Programmes(unittest.TestCase):
         self.assertNotIn("clinical numbers", case.out)
 
     def test_the_unknown_pressure_needs_the_assembled_jacobian(self):
-        case = pulmo.Case(pulmo.options_file("scenes/vcv.opts") + pulmo.DIRECT + pulmo.CUBE +
+        case = pulmo.Case(pulmo.VCV + pulmo.DIRECT + pulmo.CUBE +
                           ["-ventilator_flow_split", "common_pressure", "-snes_mf_operator"])
         self.assertNotEqual(case.code, 0)
         self.assertIn("-snes_mf_operator", case.err)

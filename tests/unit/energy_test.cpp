@@ -39,7 +39,7 @@ struct Audited {
   double operator()(const std::string &name) const { return (*this)(name, end()); }
 };
 
-const std::string lung = "-dm_plex_filename " + source("meshes/cube_lung.msh") + " -mesh_scale 1 ";
+const std::string lung = "-dm_plex_filename " + source("meshes/cube_lung.msh") + " -mesh_scale 1 -lumen_pressure off ";
 const std::string breath = "-ventilator pcv -ventilator_pip 8 -ventilator_inspiration 0.2 -ventilator_expiration 0.2 "
                            "-ventilator_ramp 0.1 ";
 const std::string gas = "-airflow -airflow_permeability 300 ";

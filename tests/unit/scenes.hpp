@@ -27,13 +27,14 @@ struct SceneSpec {
     if (airflow) s += " -airflow -airflow_permeability 0.7 -airflow_surfaces x1";
     if (ventilator)
       s += mode == "pcv" ? " -ventilator pcv -ventilator_pip 6" : " -ventilator vcv -ventilator_tidal_volume 1e-3";
-    if (mode == "vcv common_pressure") s += " -ventilator_flow_split common_pressure";
+    if (mode != "pcv")
+      s += mode == "vcv" ? " -ventilator_flow_split uniform" : " -ventilator_flow_split common_pressure";
     if (tube) s += " -tube -tube_k1 3";
     if (!chest_wall.empty())
       s += " -chest_wall -chest_wall_surfaces x0,z1 -chest_wall_stiffness 0.08 -chest_wall_stiffness_z1 0.21"
            " -chest_wall_direction " +
            chest_wall;
-    if (lumen_pressure) s += " -lumen_pressure -lumen_pressure_surfaces x1,z1";
+    s += lumen_pressure ? " -lumen_pressure -lumen_pressure_surfaces x1,z1" : " -lumen_pressure off";
     if (traction)
       s += " -traction -traction_surfaces y0,x0 -traction_value 0.1,-0.2,0.05 -traction_value_y0 0.03,0.3,0.02";
     if (support == "surfaces")

@@ -11,7 +11,7 @@ import statistics
 from pathlib import Path
 
 from benchmarks import runs
-from benchmarks.common import SCENES, SOLVERS, SOURCE, environment, fail, markdown, require, write_csv
+from benchmarks.common import PAPER, SCENES, SOLVERS, SOURCE, environment, fail, markdown, require, write_csv
 from benchmarks.keys import printed
 
 from . import truth
@@ -74,7 +74,7 @@ def block(study):
 
 
 def lung(study):
-    study.against_finer("lung, birzle", ["-options_file", SCENES / "pcv.opts", "-options_file",
+    study.against_finer("lung, birzle", ["-options_file", SCENES / "pcv.opts", *PAPER, "-options_file",
                         SOLVERS / "iterative.opts", "-ventilator_ramp_down", "0.1", "-dm_plex_filename",
                         SOURCE / "meshes/lung_test.msh"], 0.05)
 

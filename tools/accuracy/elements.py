@@ -18,7 +18,7 @@ WANTED = (0.05, 0.02)
 
 def search_of(law, paths, results, build):
     """The ladder in space of one law with each pair of elements; one step in time."""
-    search = command.prepare(["pcv", "--meshes", *map(str, paths), "--elements", *ELEMENTS, "--dt", "0.1", "--dt-factors", "1", "--schemes", "beuler",
+    search = command.prepare(["pcv", "paper", "--meshes", *map(str, paths), "--elements", *ELEMENTS, "--dt", "0.1", "--dt-factors", "1", "--schemes", "beuler",
                               "--adaptive", "0", "--tolerances", "--solvers", laws.SOLVER.get(law, "iterative"), "--clock", "cpu",
                               "--budget", BUDGET, "--output", str(results / law), "--results", str(results), *build,
                               "--", "-ventilator_ramp_down", "0.1", "-tissue", law, *LAWS[law][2]])

@@ -30,7 +30,7 @@ def meshes(folder, sizes):
 
 def search_of(law, paths, results, build):
     """The runs of one law: each ladder alone."""
-    search = command.prepare(["pcv", "--meshes", *map(str, paths), "--dt", "0.1", "--dt-factors", "2", "1", "0.5", "0.25", "--adaptive", "0",
+    search = command.prepare(["pcv", "paper", "--meshes", *map(str, paths), "--dt", "0.1", "--dt-factors", "2", "1", "0.5", "0.25", "--adaptive", "0",
                               "--tolerances", "--solvers", SOLVER.get(law, "iterative"), "--clock", "cpu", "--budget", BUDGET, "--output",
                               str(results / law), "--results", str(results), *build, "--", "-tissue", law, *LAWS[law][2]])
     if search.ladder.attempt(search.axes.base):

@@ -9,7 +9,7 @@ from .extrapolate import limit
 from .numbers import ALIASES, SHORT, short
 from .settings import SCHEMES, Mesh, Setting, Steps
 
-QUESTION = ["pcv", "--lung", "30", "21", "15", "11", "--elements", "P2-P1", "P1-P1", "--question", "C_rs=1%", "--clock", "cpu", "--budget", "10min"]
+QUESTION = ["pcv", "paper", "--lung", "30", "21", "15", "11", "--elements", "P2-P1", "P1-P1", "--question", "C_rs=1%", "--clock", "cpu", "--budget", "10min"]
 # without a ramp the flow after the release goes with 1/sqrt(t), and the integral of its square, which the fit of C_rs and R
 # takes, has no limit as dt -> 0 but that of the mesh
 FLAGS = ["-ventilator_ramp_down", "0.1"]

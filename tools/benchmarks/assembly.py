@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from . import operations
-from .common import SCENES, SOLVERS, SOURCE, environment, fail, markdown, processor, show, write_csv, write_table
+from .common import PAPER, SCENES, SOLVERS, SOURCE, environment, fail, markdown, processor, show, write_csv, write_table
 from .keys import make_lung
 
 LAWS = ["berger", "ma", "birzle", "yoshihara", "rausch"]
@@ -35,7 +35,7 @@ def arguments(parser):
 
 def scene(mesh, law):
     """Options of the benchmark program."""
-    return ["-dm_plex_filename", mesh, "-tissue", law, "-options_file", SCENES / "pcv.opts", "-options_file", SOLVERS / "direct.opts",
+    return ["-dm_plex_filename", mesh, "-tissue", law, "-options_file", SCENES / "pcv.opts", *PAPER, "-options_file", SOLVERS / "direct.opts",
             "-tissue", law]
 
 

@@ -9,7 +9,7 @@ import subprocess
 from pathlib import Path
 
 from . import plots, runs
-from .common import SCENES, SOLVERS, SOURCE, blas, environment, fail, processor, require, write_table
+from .common import PAPER, SCENES, SOLVERS, SOURCE, blas, environment, fail, processor, require, write_table
 from .strategies import measure, mesh_sentence, solver_words
 
 PEER = Path(__file__).parent / "peer_fenics.py"
@@ -96,7 +96,7 @@ def run(options):
     if options.peer and "direct" not in names and not options.peer_newton:
         fail("--peer needs the solver direct, which takes the same Newton iterations, or --peer-newton")
     options.output.mkdir(parents=True, exist_ok=True)
-    common = ["-dm_plex_filename", options.mesh, "-mesh_scale", f"{options.mesh_scale:g}", "-options_file", SCENES / "pcv.opts"]
+    common = ["-dm_plex_filename", options.mesh, "-mesh_scale", f"{options.mesh_scale:g}", "-options_file", SCENES / "pcv.opts", *PAPER]
     flags = {name: f"@{name}" for name in names} | {flags: flags for flags in options.flags}
     entries = {label: [*solver_words(f), "-ts_dt", f"{DT:g}", "-ts_max_time", f"{options.time:g}"] for label, f in flags.items()}
     results = measure(entries, common, options)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 SOURCE = Path(__file__).resolve().parent.parent.parent
 SCENES = SOURCE / "petsc_options/scenes"
+PAPER = ["-options_file", SCENES / "paper.opts"]  # the readings that the studies were made with
 SOLVERS = SOURCE / "petsc_options/solvers"
 PLAIN = "-predictor_increments 0 -snes_lag_jacobian 1 -snes_lag_preconditioner 1"  # Newton's method with nothing spared
 

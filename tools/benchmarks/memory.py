@@ -8,7 +8,7 @@ import math
 from pathlib import Path
 
 from . import plots, runs
-from .common import SCENES, SOURCE, processor, require, write_table
+from .common import PAPER, SCENES, SOURCE, processor, require, write_table
 from .keys import make_lung
 from .plots import plt
 from .strategies import measure, solver_words
@@ -92,7 +92,7 @@ def run(options):
     options.repeat, options.output, table = 1, options.results, options.output
     rows, points, everything = [], {entry: [] for entry in flags}, []
     for mesh in meshes:
-        common = ["-dm_plex_filename", mesh, "-options_file", SCENES / "pcv.opts", "-ts_max_time", f"{STEP:g}",
+        common = ["-dm_plex_filename", mesh, "-options_file", SCENES / "pcv.opts", *PAPER, "-ts_max_time", f"{STEP:g}",
                   "-log_view", "-log_view_memory"]
         results = measure(entries, common, options)
         for entry, (result,) in results.items():

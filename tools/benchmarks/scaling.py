@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from . import plots, runs
-from .common import PLAIN, SCENES, SOURCE, blas, fail, markdown, processor, require, show, write_csv, write_table
+from .common import PAPER, PLAIN, SCENES, SOURCE, blas, fail, markdown, processor, require, show, write_csv, write_table
 from .keys import make_lung
 from .plots import plt
 from .strategies import solver_words
@@ -224,7 +224,7 @@ def measure(options, mesh, ranks, flags):
     found = []
     for repeat in range(options.repeat if ranks in options.ranks else 1):
         print(f"{mesh.name} on {ranks} rank{'s' if ranks > 1 else ''} [{repeat + 1}]", flush=True)
-        result = runs.measured([*start, options.build / "pulmo", "-dm_plex_filename", mesh, "-options_file", SCENES / "pcv.opts",
+        result = runs.measured([*start, options.build / "pulmo", "-dm_plex_filename", mesh, "-options_file", SCENES / "pcv.opts", *PAPER,
                                 *solver_words(flags), "-ts_max_time", f"{options.time:g}", "-log_view", "::ascii_csv", "-output_dir"],
                                options.results / "runs", repeat, ranks, options.timeout)
         if result["code"]:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from . import plots, runs
 from .assembly import LAWS
-from .common import PLAIN, SCENES, SOURCE, blas, fail, processor, require, write_table
+from .common import PLAIN, PAPER, SCENES, SOURCE, blas, fail, processor, require, write_table
 from .strategies import measure, solver_words
 
 NEW = [*PLAIN.split(), "-snes_ksp_ew", "0", "-ksp_rtol", "1e-5", "-ksp_converged_reason", "-progress", "on"]
@@ -79,7 +79,7 @@ def programme(options, name, lines):
     path = options.output / "programmes" / f"{name}.txt"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("\n".join(lines) + "\n")
-    return ["-options_file", SCENES / "programme.opts", "-ventilator_programme", path]
+    return ["-options_file", SCENES / "programme.opts", *PAPER, "-ventilator_programme", path]
 
 
 def scene(options, case, source):
@@ -88,7 +88,7 @@ def scene(options, case, source):
     name = f"{mesh.stem}_{law}_{phase}_{k:g}_{dt:g}"
     time = options.steps * dt
     if phase == "pressure":
-        words = ["-options_file", SCENES / "pcv.opts", "-ventilator_ramp", "0", "-ts_max_time", f"{time:g}"]
+        words = ["-options_file", SCENES / "pcv.opts", *PAPER, "-ventilator_ramp", "0", "-ts_max_time", f"{time:g}"]
     elif phase in ("stretch", "release"):
         volume = ((options.stretch or STRETCH[law]) - 1) * source["summary"]["reference_volume_ml"]
         flow = volume / INFLATION

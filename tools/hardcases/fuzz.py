@@ -41,7 +41,7 @@ def programme(dice, volume):
 def scene(dice):
     """Options and ranks of a random scene, and the text of its programme."""
     law = dice.choice(list(TISSUE))
-    options = ["-tissue", law]
+    options = pulmo.PAPER + ["-tissue", law]
     for name, value in TISSUE[law].items():
         if dice.random() < 0.3:
             options += [f"-tissue_{name}", f"{value * between(dice, 0.5, 2):.4g}"]

@@ -115,6 +115,8 @@ public:
   const char *name() const override { return "airflow"; }
   const char *about() const override { return "Darcy flow of alveolar air (mass balance, pressure field)"; }
   bool active() const override { return on_; }
+  /// Open to the ventilator; without airflow the surfaces that would be.
+  const std::vector<std::string> &surfaces() const { return surfaces_; }
   PetscReal porosity() const { return porosity_; }
   /// Permeability over viscosity of the tissue at rest, mm^2/(kPa s).
   PetscReal permeability_at_rest() const { return laws_[chosen_]->at_rest(); }
@@ -148,7 +150,6 @@ public:
   PetscErrorCode announce(SceneFacts &facts) override
   {
     facts.airflow = true;
-    facts.airway_surfaces = surfaces_;
     return PETSC_SUCCESS;
   }
 

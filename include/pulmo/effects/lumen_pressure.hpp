@@ -3,10 +3,13 @@
 ///
 /// Without it the total traction on the airway is the spring alone, as in the paper. With it the traction
 /// gains -p J F^-T N, with the local field p on the surface (the uniform gas pressure without airflow).
+/// It is on by default wherever there is a ventilator. (Without one the airway is at atmospheric pressure, p = 0.)
 #pragma once
 
 #include "pulmo/effect.hpp"
 #include "pulmo/mesh.hpp"
+
+#include <algorithm>
 
 namespace pulmo {
 
@@ -50,14 +53,43 @@ public:
   const char *name() const override { return "lumen_pressure"; }
   const char *about() const override { return "gas pressure on the airway wall"; }
   bool active() const override { return on_; }
+  const std::vector<std::string> &surfaces() const { return surfaces_; }
 
   PetscErrorCode declare(Options &options) override
   {
     PetscFunctionBeginUser;
     options.group(name(), about());
-    PetscCall(options.flag("", "the gas presses on the airway wall (off: the paper's reading)", on_));
+    PetscCall(options.given("", given_));
+    PetscCall(options.flag("",
+                           "the gas presses on the airway wall, in every scene with a ventilator (off: the paper's "
+                           "reading)",
+                           on_));
     options.group(name(), about(), on_, "-lumen_pressure");
-    PetscCall(options.names("surfaces", "surfaces on which the gas presses", surfaces_));
+    PetscCall(options.given("surfaces", surfaces_given_));
+    PetscCall(options.names("surfaces", "surfaces on which the gas presses (default: those of -airflow_surfaces)",
+                            surfaces_));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+  PetscErrorCode consider(Options &options, const Mesh &mesh, const SceneFacts &facts) override
+  {
+    PetscFunctionBeginUser;
+    if (!on_) PetscFunctionReturn(PETSC_SUCCESS);
+    if (!surfaces_given_) {
+      surfaces_ = facts.airway_surfaces;
+      options.settle("surfaces", name(), surfaces_);
+    }
+    if (given_ || surfaces_given_ || (facts.ventilator && facts.airflow)) PetscFunctionReturn(PETSC_SUCCESS);
+    // not asked for: on where there is a gas and a wall
+    const auto exists = [&](const std::string &surface) { return mesh.surfaces().count(surface) > 0; };
+    on_ = facts.ventilator && std::all_of(surfaces_.begin(), surfaces_.end(), exists);
+    if (on_) PetscFunctionReturn(PETSC_SUCCESS);
+    options.turn_off(name());
+    if (facts.ventilator)
+      PetscCall(PetscPrintf(options.comm(),
+                            "pulmo: note: the mesh has no surface %s, so the gas presses on no airway wall; name the "
+                            "wall with -lumen_pressure_surfaces, or give -lumen_pressure off\n",
+                            surfaces_.front().c_str()));
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
@@ -89,7 +121,7 @@ public:
   }
 
 private:
-  bool on_ = false;
+  bool on_ = true, given_ = false, surfaces_given_ = false;
   std::vector<std::string> surfaces_{"airway"};
 };
 

@@ -88,14 +88,18 @@ public:
                              "whether a phase 'settle', which is no breath, comes before the first one: auto: where "
                              "PEEP or a load moves the lung at rest; off: for PEEP only",
                              settle_));
+    options.tolerate("settle"); // scenes/paper.opts goes with every scene
     if (pcv || vcv) settle_duration_ = ramp_ + expiration_;
     PetscCall(options.real("settle_duration", "s", Range::positive(),
                            "duration of that phase (default: pcv and vcv ramp + expiration, else 2)",
                            settle_duration_));
     options.group(name(), "prescribed flow", active() && !pcv, "-ventilator vcv, supersyringe or programme");
-    PetscCall(options.choice(
-        "flow_split", {"uniform", "common_pressure"},
-        "how patches of airway share a prescribed flow: by area, or so that they have one pressure", split_));
+    PetscCall(options.choice("flow_split", {"auto", "uniform", "common_pressure"},
+                             "how patches of airway share a prescribed flow: uniform: by area (the paper's reading); "
+                             "common_pressure: so that they have one pressure; auto: common_pressure where there is "
+                             "more than one patch",
+                             split_));
+    options.tolerate("flow_split");
 
     PetscCall(check_settings(options));
     if (mode_ == "programme") {
@@ -116,7 +120,9 @@ public:
     facts.settling.pressure = starting_pressure() != 0;
     if (settle_ == "auto" && begins_with_breath() && !settles())
       facts.settling.programme = std::make_shared<Programme>(programme(true));
-    facts.flow_split = split_ == "uniform" ? FlowSplit::uniform : FlowSplit::common_pressure;
+    facts.flow_split = split_ == "auto"      ? FlowSplit::automatic
+                       : split_ == "uniform" ? FlowSplit::uniform
+                                             : FlowSplit::common_pressure;
     return PETSC_SUCCESS;
   }
 
@@ -214,7 +220,7 @@ private:
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
-  std::string mode_ = "off", file_, split_ = "uniform", settle_ = "auto";
+  std::string mode_ = "off", file_, split_ = "auto", settle_ = "auto";
   PetscReal pip_ = 6, peep_ = 0, tidal_volume_ = 500, step_volume_ = 100;
   PetscReal inspiration_ = 1, pause_ = 0, expiration_ = 2, ramp_ = 0.1, ramp_down_ = 0;
   PetscReal settle_duration_ = 2, dt_scale_ = 1;

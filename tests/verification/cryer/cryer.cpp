@@ -60,7 +60,7 @@ void ball(Load kind, const SmallStrain &k, const Series &series, int n, int step
   pulmo::Run run(registry);
   bool finished = false;
   const std::string gas =
-      " -ventilator pcv -ventilator_ramp 0 -ventilator_inspiration 1 -mesh_scale 1 -ventilator_pip " +
+      " -lumen_pressure off -ventilator pcv -ventilator_ramp 0 -ventilator_inspiration 1 -mesh_scale 1 -ventilator_pip " +
       column::number(load / units::kPa_per_cmH2O);
   PULMO_OK(prepare(run, consolidation(k, mesh.path(), "side", t_end / steps, t_end) +
                             " -support -support_surfaces x0,y0,z0 -support_components_x0 x -support_components_y0 y"

@@ -148,8 +148,8 @@ TEST(ManufacturedBreath, BarsHoldTheTruth)
         set_options("-options_file " + source("petsc_options/solvers/direct.opts") + " -dm_plex_filename " +
                     source("meshes/") + mesh + ".msh -mesh_scale 1 -tissue yoshihara -airflow -airflow_surfaces x1 " +
                     "-airflow_permeability_law rational -chest_wall -chest_wall_surfaces x1 -chest_wall_stiffness " +
-                    std::to_string(mms::spring) + " -ventilator programme -ventilator_programme " + rise +
-                    " -ts_dt 0.05 -energy_audit off -progress off -error_estimate -output_dir " + directory +
+                    std::to_string(mms::spring) + " -lumen_pressure off -ventilator programme -ventilator_programme " +
+                    rise + " -ts_dt 0.05 -energy_audit off -progress off -error_estimate -output_dir " + directory +
                     " -output_overwrite" + integrator.options));
     PULMO_OK(pulmo::run(breath(), finished));
     ASSERT_TRUE(finished);
