@@ -552,7 +552,7 @@ class InputErrors(unittest.TestCase):
 
     def test_the_unspoilt_mesh_runs(self):
         """Or every error above might have another cause."""
-        case = pulmo.finished(NO_MESH + ["-dm_plex_filename", self.table["misspelt option"][0][5], "-ts_max_time", "0.05"])
+        case = pulmo.finished(NO_MESH + ["-dm_plex_filename", self.table["misspelt option"][0][-3], "-ts_max_time", "0.05"])
         self.assertEqual(case.json()["cells"], 100)
 
     def test_one_rank(self):
@@ -589,7 +589,7 @@ class InputErrors(unittest.TestCase):
         self.assertAlmostEqual(case.json()["reference_volume_ml"], 1, places=9)
 
     def test_a_finished_run_is_kept(self):
-        good = self.table["misspelt option"][0][:6] + ["-ts_max_time", "0.05"]
+        good = self.table["misspelt option"][0][:-2] + ["-ts_max_time", "0.05"]
         first = pulmo.finished(good)
 
         def content():
@@ -617,7 +617,7 @@ class InputErrors(unittest.TestCase):
         self.assertEqual(os.listdir(folder), [])
 
     def test_an_unused_petsc_option_is_a_warning(self):
-        good = self.table["misspelt option"][0][:6]
+        good = self.table["misspelt option"][0][:-2]
         case = pulmo.finished(good + ["-ts_max_time", "0.05", "-snes_mx_it", "3"])
         warnings = re.findall(r"^pulmo: warning: .*$", case.out, re.M)
         self.assertEqual(len(warnings), 1, case.out)
