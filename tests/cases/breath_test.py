@@ -198,7 +198,7 @@ class EndOfInspiration(unittest.TestCase):
         mesh = case_meshes.bodies("stiff", "soft")
         scene = pulmo.options_file("scenes/vcv.opts") + pulmo.FLOW_OF_TWO + pulmo.COMMON + pulmo.QUIET + [
             "-chest_wall_surfaces", "stiff,soft", "-chest_wall_stiffness_stiff", "0.2", "-chest_wall_stiffness_soft", "0.02"]
-        one, *others = (pulmo.finished(pulmo.DIRECT + scene + mesh, ranks=ranks) for ranks in (1, 2, 3))
+        one, *others = (pulmo.finished(pulmo.options_file("solvers/iterative.opts") + scene + mesh, ranks=ranks) for ranks in (1, 2, 3))
         summary, rows = one.json(), one.signals()
         breath = summary["breaths"][0]
         pause = [i for i, p in enumerate(rows["phase"]) if p == "pause"]
