@@ -1,6 +1,5 @@
 // The connected bodies of a mesh: numbering, openings, regions, pins.
 #include "pulmo/mesh.hpp"
-#include "pulmo/msh.hpp"
 
 #include <algorithm>
 #include <array>
@@ -85,24 +84,6 @@ PetscErrorCode next_body(MPI_Comm comm, const std::vector<PetscInt> &body, Petsc
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-/// Mesh points in [begin, end) that a label marks, in order.
-PetscErrorCode labelled_points(DM dm, const char *name, PetscInt begin, PetscInt end, std::vector<PetscInt> &points)
-{
-  DMLabel label;
-  PetscInt none;
-
-  PetscFunctionBeginUser;
-  points.clear();
-  PetscCall(DMGetLabel(dm, name, &label));
-  PetscCall(DMLabelGetDefaultValue(label, &none));
-  for (PetscInt p = begin; p < end; ++p) {
-    PetscInt value;
-    PetscCall(DMLabelGetValue(label, p, &value));
-    if (value != none) points.push_back(p);
-  }
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
 } // namespace
 
 PetscErrorCode Mesh::require_in_each_body(const std::vector<std::string> &names, const std::string &complaint) const
@@ -150,7 +131,7 @@ PetscErrorCode Mesh::require_in_each_body(const std::vector<std::string> &names,
 PetscErrorCode Mesh::regions(std::vector<Region> &list) const
 {
   const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
-  PetscInt vertex_begin, vertex_end, begin, end, n_labels, last = -1;
+  PetscInt vertex_begin, vertex_end, begin, end, last = -1;
   std::vector<PetscInt> body_of, cell_body;
   struct Body {
     Region region;
@@ -196,24 +177,18 @@ PetscErrorCode Mesh::regions(std::vector<Region> &list) const
   });
 
   list.clear();
-  PetscCall(DMGetNumLabels(dm_, &n_labels));
-  for (PetscInt l = 0; l < n_labels; ++l) {
-    const char *name;
+  for (const Part &part : parts_) {
+    if (part.dimension != 3) continue;
     Region region;
-    PetscCall(DMGetLabelName(dm_, l, &name));
-    if (is_petsc_label(name)) continue;
-    PetscCall(labelled_points(dm_, name, begin, end, region.cells));
-    auto found = static_cast<PetscInt>(region.cells.size());
-    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &found, 1, MPIU_INT, MPI_SUM, comm));
-    if (found == 0) continue;
-    region.name = name;
+    region.name = part.name;
+    PetscCall(elements(part, region.cells));
     for (PetscInt &c : region.cells) c -= begin;
     for (Body &body : bodies) {
       int same = body.region.cells == region.cells;
       PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &same, 1, MPI_INT, MPI_LAND, comm));
       if (!same || !body.region.name.empty()) continue;
       region.body = true;
-      body.region.name = name;
+      body.region.name = part.name;
     }
     list.push_back(region);
   }

@@ -2,6 +2,7 @@
 
 #include "pulmo/output.hpp"
 #include "pulmo/pulmo.hpp"
+#include "pulmo/read_mesh.hpp"
 #include "pulmo/units.hpp"
 
 #include <algorithm>

@@ -9,7 +9,6 @@
 #include <cstring>
 #include <iterator>
 #include <map>
-#include <numeric>
 #include <optional>
 #include <set>
 #include <string_view>
@@ -19,13 +18,13 @@ namespace pulmo {
 
 namespace {
 
-/// What PETSc's reader has room for: letters of a physical name, tags of an element.
+/// Letters of a physical name, tags of an element.
 constexpr std::size_t longest_name = 120;
-constexpr long max_tags = 100;
+constexpr long max_tags = 1000;
 /// A table of all node tags up to the largest is made; so many may be unused beyond 100 per node.
 constexpr long spare_tags = 1000000;
 
-/// Ends the reading; what msh_fault() returns.
+/// Ends the reading; what read_msh() returns.
 struct Fault {
   std::string text;
 };
@@ -59,6 +58,15 @@ public:
     const std::string_view found(from, static_cast<std::size_t>(at_ - from));
     if (at_ < end_) ++at_;
     return found;
+  }
+
+  /// Goes on after the next @p text; false if there is none.
+  bool skip_to(const std::string &text)
+  {
+    const char *found = std::search(at_, end_, text.begin(), text.end());
+    if (found == end_) return false;
+    at_ = found + text.size();
+    return true;
   }
 
   /// What follows the last word on its line.
@@ -135,57 +143,46 @@ private:
   std::size_t size_bytes_ = 8;
 };
 
-using Triangle = std::array<int, 3>; ///< nodes in ascending order
-
-Triangle sorted(int a, int b, int c)
-{
-  Triangle t{a, b, c};
-  std::sort(t.begin(), t.end());
-  return t;
-}
-
-/// Reads the sections that PETSc reads, in its order.
+/// Reads what a mesh of tetrahedra needs: other sections are passed over.
 class Scan {
 public:
-  explicit Scan(const std::string &content) : in_(content) {}
+  Scan(const std::string &content, MeshFile &mesh) : in_(content), mesh_(mesh) {}
 
   void run()
   {
+    mesh_ = MeshFile();
     format();
-    std::string_view next = section();
-    if (next == "$PhysicalNames") {
-      names();
-      next = section();
+    std::set<std::string> read;
+    for (std::string name(section()); !name.empty(); name = section()) {
+      const bool needed = name == "$PhysicalNames" || name == "$Entities" || name == "$PartitionedEntities" ||
+                          name == "$Nodes" || name == "$Elements";
+      if (name[0] != '$' && read.count("$Elements")) break; // what follows is no part of the mesh
+      if (name[0] != '$') in_.unreadable("a word outside of the sections");
+      const std::string end = "$End" + name.substr(1);
+      if (!needed) {
+        if (in_.skip_to(end)) continue;
+        if (read.count("$Elements")) break;
+        in_.unreadable(name + " without " + end);
+      }
+      if (!read.insert(name).second) in_.unreadable("a second " + name);
+      if (name == "$PhysicalNames") names();
+      if (name == "$Entities") entities();
+      if (name == "$PartitionedEntities") partitioned_entities();
+      if (name == "$Nodes") version_ == 41 ? nodes_41() : nodes_22();
+      if (name == "$Elements") {
+        if (version_ == 41 && !read.count("$Entities")) in_.unreadable("no $Entities");
+        if (!read.count("$Nodes")) in_.unreadable("no $Nodes");
+        version_ == 41 ? elements_41() : elements_22();
+      }
+      if (in_.word() != end) in_.unreadable("no " + end);
     }
-    if (version_ == 41) {
-      expect(next, "$Entities");
-      entities();
-      close("$EndEntities");
-      next = section();
-    }
-    expect(next, "$Nodes");
-    version_ == 41 ? nodes_41() : nodes_22();
-    close("$EndNodes");
-    expect(section(), "$Elements");
-    version_ == 41 ? elements_41() : elements_22();
-    close("$EndElements");
+    for (const char *name : {"$Nodes", "$Elements"})
+      if (!read.count(name)) in_.unreadable(std::string("no ") + name);
     check_elements();
-    check_faces();
   }
 
 private:
-  struct Facet {
-    Triangle nodes;
-    long id, physical;
-  };
-
   // ------------------------------------------------------------------------------------------------------- sections
-
-  void expect(std::string_view found, const char *name) const
-  {
-    if (found != name) in_.unreadable(std::string("no ") + name);
-  }
-  void close(const char *name) { expect(in_.word(), name); }
 
   /// The name of the next section; comments are passed over.
   std::string_view section()
@@ -193,14 +190,13 @@ private:
     for (;;) {
       const std::string_view name = in_.word();
       if (name != "$Comments") return name;
-      for (std::string_view word = in_.word(); word != "$EndComments"; word = in_.word())
-        if (word.empty()) in_.unreadable("$Comments without $EndComments");
+      if (!in_.skip_to("$EndComments")) in_.unreadable("$Comments without $EndComments");
     }
   }
 
   void format()
   {
-    expect(section(), "$MeshFormat");
+    if (section() != "$MeshFormat") in_.unreadable("no $MeshFormat");
     const double version = in_.written<double>("the version");
     const long type = in_.written<long>("the file type"), bytes = in_.written<long>("the data size");
     if (version != 2.2 && version != 4.1) {
@@ -213,12 +209,11 @@ private:
       in_.unreadable("neither ASCII nor binary");
     in_.format(type == 1, static_cast<std::size_t>(bytes));
     if (type == 1 && in_.whole("the byte order") != 1) in_.unreadable("the byte order of another machine");
-    close("$EndMeshFormat");
+    if (in_.word() != "$EndMeshFormat") in_.unreadable("no $EndMeshFormat");
   }
 
   void names()
   {
-    std::set<std::pair<long, long>> named; // dimension and tag of a group
     for (long i = in_.count(in_.written<long>("the number of names"), "names"); i > 0; --i) {
       const long dimension = in_.written<long>("the dimension of a name"), tag = in_.written<long>("the tag of a name");
       const std::string_view line = in_.rest_of_line();
@@ -230,38 +225,75 @@ private:
       const auto odd = [](unsigned char c) { return c < 32 || c == '"' || c == ':' || c == 127; };
       if (name.empty() || name.size() > longest_name || std::any_of(name.begin(), name.end(), odd))
         in_.unreadable("a physical name has 1 to 120 letters without quotes and colons");
-      if (is_petsc_label(name))
+      if (dimension >= 2 && is_petsc_label(name))
         throw Fault{"names a group '" + name + "', which PETSc keeps for itself; give it another name"};
-      if (!named.insert({dimension, tag}).second) in_.unreadable("two names for one group");
-      if (dimension == 2) surface_names_[tag] = name;
+      if (tag == 0) in_.unreadable("a name for group 0, which is none");
+      std::string &known = mesh_.groups[group(static_cast<int>(dimension), tag)].name;
+      if (!known.empty()) in_.unreadable("two names for one group");
+      known = name;
     }
-    close("$EndPhysicalNames");
+  }
+
+  /// Index of a physical group, -1 for tag 0. The sign of a tag is the orientation of what belongs to the group.
+  int group(int dimension, long tag)
+  {
+    if (tag == 0) return -1;
+    const auto [found, added] = group_.insert({{dimension, std::abs(tag)}, static_cast<int>(mesh_.groups.size())});
+    if (added) mesh_.groups.push_back({dimension, std::abs(tag), ""});
+    return found->second;
+  }
+
+  /// The numbers of points, curves, surfaces and volumes.
+  std::array<long, 4> entity_counts()
+  {
+    std::array<long, 4> counts;
+    for (long &n : counts) n = in_.count(in_.size("the number of entities"), "entities");
+    return counts;
   }
 
   void entities()
   {
-    std::array<long, 4> counts;
-    for (long &n : counts) n = in_.count(in_.size("the number of entities"), "entities");
+    const std::array<long, 4> counts = entity_counts();
     for (int dimension = 0; dimension < 4; ++dimension)
       for (long i = 0; i < counts[dimension]; ++i) {
         const long tag = in_.whole("the tag of an entity");
-        for (int k = 0; k < (dimension == 0 ? 3 : 6); ++k) in_.real("the box of an entity");
-        const long n = in_.count(in_.size("the number of physical tags"), "physical tags");
-        long physical = 0;
-        for (long k = 0; k < n; ++k) {
-          const long value = in_.whole("a physical tag");
-          if (k == 0) physical = value;
-        }
-        if (n > 1 && dimension > 1)
-          throw Fault{"puts " + std::string(dimension == 2 ? "surface " : "volume ") + std::to_string(tag) +
-                      " into several physical groups, of which MSH 4.1 would give only the first; save it as MSH 2.2 "
-                      "(gmsh -format msh22)"};
-        if (n > 4) in_.unreadable("an entity in more than 4 physical groups");
-        if (!physical_.insert({{dimension, tag}, physical}).second) in_.unreadable("an entity given twice");
-        if (dimension == 0) continue;
-        for (long k = in_.count(in_.size("the number of bounding entities"), "bounding entities"); k > 0; --k)
-          in_.whole("a bounding entity");
+        entity(dimension, tag, true);
       }
+  }
+
+  /// The pieces of entities that gmsh's partitions make; their elements belong to the groups of the piece.
+  void partitioned_entities()
+  {
+    in_.size("the number of partitions");
+    for (long k = in_.count(in_.size("the number of ghost entities"), "ghost entities"); k > 0; --k)
+      for (int i = 0; i < 2; ++i) in_.whole("a ghost entity");
+    const std::array<long, 4> counts = entity_counts();
+    for (int dimension = 0; dimension < 4; ++dimension)
+      for (long i = 0; i < counts[dimension]; ++i) {
+        const long tag = in_.whole("the tag of an entity"), parent = in_.whole("the dimension of a parent");
+        in_.whole("the tag of a parent");
+        for (long k = in_.count(in_.size("the partitions of an entity"), "partitions"); k > 0; --k)
+          in_.whole("a partition");
+        // where partitions meet within a volume, the surface between them carries the numbers of the volume's groups
+        entity(dimension, tag, parent == dimension);
+      }
+  }
+
+  /// What follows the tag of an entity.
+  void entity(int dimension, long tag, bool in_groups)
+  {
+    for (int k = 0; k < (dimension == 0 ? 3 : 6); ++k) in_.real("the box of an entity");
+    std::vector<int> groups;
+    for (long k = in_.count(in_.size("the number of physical tags"), "physical tags"); k > 0; --k) {
+      const long physical = in_.whole("a physical tag");
+      const int index = in_groups ? group(dimension, physical) : -1;
+      if (index >= 0 && std::find(groups.begin(), groups.end(), index) == groups.end()) groups.push_back(index);
+    }
+    if (groups.empty()) groups.push_back(-1);
+    if (!groups_of_.insert({{dimension, tag}, groups}).second) in_.unreadable("an entity given twice");
+    if (dimension == 0) return;
+    for (long k = in_.count(in_.size("the number of bounding entities"), "bounding entities"); k > 0; --k)
+      in_.whole("a bounding entity");
   }
 
   // ---------------------------------------------------------------------------------------------------------- nodes
@@ -270,7 +302,7 @@ private:
   {
     if (tag <= 0) in_.unreadable("a node's tag that is not positive");
     tags_.push_back(tag);
-    x_.push_back(x);
+    mesh_.nodes.push_back(x);
   }
 
   std::array<double, 3> place()
@@ -326,7 +358,6 @@ private:
       if (index >= 0) throw Fault{"gives the tag " + std::to_string(tags_[i]) + " to two nodes; save it anew in gmsh"};
       index = static_cast<int>(i);
     }
-    in_cell_.assign(tags_.size(), 0);
   }
 
   int node_index(long tag) const
@@ -344,7 +375,7 @@ private:
   {
     const long dimension = in_.whole("the dimension of a block"), tag = in_.whole("the entity of a block");
     const std::pair<int, long> entity{static_cast<int>(dimension), tag};
-    if (dimension < 0 || dimension > 3 || !physical_.count(entity)) in_.unreadable("a block of an unknown entity");
+    if (dimension < 0 || dimension > 3) in_.unreadable("a block of no dimension from 0 to 3");
     return entity;
   }
 
@@ -376,9 +407,9 @@ private:
         if (in_.binary()) id = in_.whole("the tag of an element");
         for (long t = 0; t < tags; ++t) {
           const long value = in_.whole("a tag");
-          if (t == 0) physical = value;
+          if (t == 0) physical = value; // then the entity and the partitions
         }
-        element(id, type, physical);
+        element(id, type, {group(shape(type)[0], physical)});
       }
     }
   }
@@ -394,15 +425,24 @@ private:
       const long type = in_.whole("the type of an element");
       const long in_block = in_.count(in_.size("the elements of a block"), "elements");
       if (shape(type)[0] != entity.first) in_.unreadable("elements of another dimension than their block's");
+      const auto known = groups_of_.find(entity);
+      if (known == groups_of_.end() && entity.first >= 2)
+        throw Fault{
+            std::string("has elements on ") + (entity.first == 2 ? "surface " : "volume ") +
+            std::to_string(entity.second) +
+            ", whose groups it does not tell ($Entities leaves it out); save it as MSH 2.2 (gmsh -format msh22, "
+            "meshio's gmsh22)"};
+      const std::vector<int> groups = known == groups_of_.end() ? std::vector<int>{-1} : known->second;
       for (long i = 0; i < in_block; ++i, ++read) {
         const long id = in_.size("the tag of an element");
-        element(id, type, physical_.at(entity));
+        element(id, type, groups);
       }
     }
     if (read != n) in_.unreadable("another number of elements than announced");
   }
 
-  void element(long id, long type, long physical)
+  /// Elements of curves and points are of no use; their groups neither.
+  void element(long id, long type, const std::vector<int> &groups)
   {
     const auto [dimension, n] = shape(type);
     std::array<int, 8> nodes{};
@@ -413,120 +453,43 @@ private:
         if (nodes[i] == nodes[j])
           throw Fault{"has element " + std::to_string(id) + ", which uses a node twice; mesh anew"};
     if (type == 4) {
-      cells_.push_back({nodes[0], nodes[1], nodes[2], nodes[3]});
-      for (int i = 0; i < 4; ++i) in_cell_[nodes[i]] = 1;
+      for (const int group : groups) mesh_.cells.push_back({id, group, {nodes[0], nodes[1], nodes[2], nodes[3]}});
     } else if (dimension == 3) {
       ++foreign_;
     } else if (type == 2) {
-      facets_.push_back({sorted(nodes[0], nodes[1], nodes[2]), id, physical});
+      for (const int group : groups) mesh_.facets.push_back({id, group, {nodes[0], nodes[1], nodes[2]}});
     } else if (dimension == 2) {
       quadrilateral_ = id;
-    } else {
-      for (int i = 0; i < n; ++i) low_.push_back({id, nodes[i]});
     }
-  }
-
-  // --------------------------------------------------------------------------------------------------------- checks
-
-  std::string at(const std::vector<int> &nodes) const
-  {
-    std::array<double, 3> centre{};
-    char text[100];
-    for (const int i : nodes)
-      for (int d = 0; d < 3; ++d) centre[d] += x_[i][d] / static_cast<double>(nodes.size());
-    std::snprintf(text, sizeof(text), "(%.6g, %.6g, %.6g)", centre[0], centre[1], centre[2]);
-    return text;
-  }
-
-  [[noreturn]] void stray_facet(long id, long physical) const
-  {
-    const auto name = surface_names_.find(physical);
-    throw Fault{"has facet " + std::to_string(id) + (name == surface_names_.end() ? "" : " of '" + name->second + "'") +
-                ", which is no face of a tetrahedron; mesh surface and volume together"};
   }
 
   void check_elements() const
   {
     if (foreign_ > 0)
       throw Fault{"holds " + std::to_string(foreign_) + " cells that are not tetrahedra; mesh with tetrahedra only"};
-    if (cells_.empty()) throw Fault{"holds no volume elements; mesh the volume"};
-    if (quadrilateral_) stray_facet(*quadrilateral_, 0);
-    for (const auto &[id, node] : low_) // PETSc would take the node for a cell
-      if (!in_cell_[node])
-        throw Fault{"has element " + std::to_string(id) + " on node " + std::to_string(tags_[node]) +
-                    ", which belongs to no tetrahedron; save the volume and its surfaces only"};
-  }
-
-  void check_faces()
-  {
-    std::vector<Triangle> faces;
-    faces.reserve(4 * cells_.size());
-    for (const auto &c : cells_)
-      for (int left_out = 0; left_out < 4; ++left_out)
-        faces.push_back(sorted(c[left_out == 0], c[1 + (left_out <= 1)], c[2 + (left_out <= 2)]));
-    std::sort(faces.begin(), faces.end());
-    std::sort(facets_.begin(), facets_.end(), [](const Facet &a, const Facet &b) { return a.nodes < b.nodes; });
-    for (const Facet &facet : facets_)
-      if (!std::binary_search(faces.begin(), faces.end(), facet.nodes)) stray_facet(facet.id, facet.physical);
-
-    std::vector<Triangle> outer;
-    for (std::size_t i = 0, j; i < faces.size(); i = j) {
-      for (j = i + 1; j < faces.size() && faces[j] == faces[i];) ++j;
-      if (j - i > 2)
-        throw Fault{"has cells that overlap: more than two share a face at " + at({faces[i].begin(), faces[i].end()}) +
-                    "; mesh anew"};
-      if (j - i == 1) outer.push_back(faces[i]);
-    }
-    check_tears(outer);
-  }
-
-  /// Faces that lie on one another without being joined: nodes are there twice. A surface named on both sides is meant.
-  void check_tears(const std::vector<Triangle> &outer) const
-  {
-    std::vector<int> order(x_.size()), place(x_.size());
-    std::iota(order.begin(), order.end(), 0);
-    std::sort(order.begin(), order.end(), [&](int a, int b) { return x_[a] < x_[b]; });
-    bool twice = false;
-    for (std::size_t i = 0; i < order.size(); ++i) {
-      const bool same = i > 0 && x_[order[i]] == x_[order[i - 1]];
-      place[order[i]] = same ? place[order[i - 1]] : order[i];
-      twice = twice || same;
-    }
-    if (!twice) return;
-    std::map<Triangle, bool> named_at; // place of an outer face: whether it has a name
-    for (const Triangle &face : outer) {
-      const auto facet = std::lower_bound(facets_.begin(), facets_.end(), face,
-                                          [](const Facet &f, const Triangle &t) { return f.nodes < t; });
-      const bool named = facet != facets_.end() && facet->nodes == face && surface_names_.count(facet->physical);
-      const auto [other, first] = named_at.insert({sorted(place[face[0]], place[face[1]], place[face[2]]), named});
-      if (!first && !(named && other->second))
-        throw Fault{"is torn: its nodes are there twice on the face at " + at({face.begin(), face.end()}) +
-                    "; join them (gmsh: Coherence Mesh), or name both sides of what is meant to be a slit"};
-    }
+    if (quadrilateral_ && !mesh_.cells.empty())
+      throw Fault{"has facet " + std::to_string(*quadrilateral_) +
+                  ", which is no face of a tetrahedron; mesh surface and volume together"};
   }
 
   Input in_;
+  MeshFile &mesh_;
   int version_ = 0;
-  std::map<long, std::string> surface_names_;     // by tag
-  std::map<std::pair<int, long>, long> physical_; // first physical tag of an entity
-  std::vector<long> tags_;                        // of the nodes, as the next two
-  std::vector<std::array<double, 3>> x_;          // unscaled
-  std::vector<char> in_cell_;                     // belongs to a tetrahedron
-  long first_ = 0;                                // least tag of a node
-  std::vector<int> index_;                        // node of each tag from first_ on, -1 for none
-  std::vector<std::array<int, 4>> cells_;
-  std::vector<Facet> facets_;
-  std::vector<std::pair<long, int>> low_; // nodes of lines and points: element, node
+  std::map<std::pair<int, long>, int> group_;                  // index of each group, by dimension and tag
+  std::map<std::pair<int, long>, std::vector<int>> groups_of_; // each entity, -1 if it is in none
+  std::vector<long> tags_;                                     // of the nodes
+  long first_ = 0;                                             // least tag of a node
+  std::vector<int> index_;                                     // node of each tag from first_ on, -1 for none
   std::optional<long> quadrilateral_;
   long foreign_ = 0;
 };
 
 } // namespace
 
-std::string msh_fault(const std::string &content)
+std::string read_msh(const std::string &content, MeshFile &mesh)
 {
   try {
-    Scan(content).run();
+    Scan(content, mesh).run();
   } catch (const Fault &fault) {
     return fault.text;
   }

@@ -3,8 +3,10 @@
 #pragma once
 
 #include "pulmo/elements.hpp"
+#include "pulmo/mesh_file.hpp"
 
 #include <map>
+#include <vector>
 
 namespace pulmo {
 
@@ -16,6 +18,16 @@ public:
     DMLabel label = nullptr; ///< owned by the DM
     PetscInt value = 0;      ///< stratum of the label
     PetscReal area = 0;      ///< mm^2, reference configuration, all ranks
+  };
+  /// What the file says of a name: the ranks together have all of it and no more (Mesh::read checks that). Surface and
+  /// volume of one name are two parts.
+  struct Part {
+    std::string name;
+    PetscInt dimension = 2;  ///< 2: facets, 3: cells; the stratum of the label
+    PetscInt elements = 0;   ///< facets or cells of the file
+    PetscReal measure = 0;   ///< mm^2 or mm^3, reference configuration, all ranks
+    bool inside = false;     ///< has facets within the volume: no boundary
+    DMLabel label = nullptr; ///< owned by the DM
   };
   /// A part of the volume: a connected body, or what carries a physical name.
   struct Region {
@@ -30,7 +42,7 @@ public:
     PetscReal x[3] = {0, 0, 0}; ///< mm
   };
 
-  /// Declares -mesh_scale; the file name is PETSc's -dm_plex_filename.
+  /// Declares -mesh_scale and -mesh_prefer; the file name is PETSc's -dm_plex_filename.
   PetscErrorCode declare(Options &options);
   /// Reads -dm_plex_filename, renumbers, distributes, scales and checks it. @p ventilated: the scene is a lung, so a
   /// volume outside what any lung has betrays the wrong unit.
@@ -43,6 +55,10 @@ public:
   PetscInt cells() const { return cells_; }      ///< on all ranks
   const std::map<std::string, Surface> &surfaces() const { return surfaces_; }
   const Surface &surface(const std::string &name) const { return surfaces_.at(name); }
+  /// Every name of the file's, those of facets first.
+  const std::vector<Part> &parts() const { return parts_; }
+  /// Facets or cells of a part on this rank (mesh points, in order).
+  PetscErrorCode elements(const Part &part, std::vector<PetscInt> &points) const;
   /// The facets of a surface on this rank (mesh points).
   PetscErrorCode facets(const std::string &name, std::vector<PetscInt> &points) const;
 
@@ -63,6 +79,10 @@ public:
   }
 
 private:
+  /// Makes the mesh and its labels on rank 0.
+  PetscErrorCode build(MPI_Comm comm, const NamedMesh &file);
+  /// User error unless number, area and volume of every part are those of the file.
+  PetscErrorCode check_parts(MPI_Comm comm, PetscInt cells_in_file, PetscReal volume_of_file) const;
   PetscErrorCode check_cells(const Options &options);
   PetscErrorCode find_surfaces(const Options &options);
   PetscErrorCode pin_body(const std::vector<PetscInt> &vertices, std::vector<Pin> &pins) const;
@@ -74,13 +94,11 @@ private:
   bool scale_given_ = false;
   PetscInt cells_ = 0;
   std::map<std::string, Surface> surfaces_;
-  std::vector<std::string> inside_; ///< names of facets inside the volume: no boundary
+  std::vector<std::string> prefer_;
+  std::vector<Part> parts_;
 };
 
 /// Makes `-petscpartitioner_type metis` known to PETSc (METIS k-way on the rank that holds the mesh).
 PetscErrorCode register_metis_partitioner();
-
-/// Looks at a mesh file on rank 0 alone, so that an unreadable one is a clear error on all ranks that names @p option.
-PetscErrorCode check_mesh_file(MPI_Comm comm, const char *option, const std::string &file);
 
 } // namespace pulmo

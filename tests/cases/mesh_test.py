@@ -1,0 +1,237 @@
+#!/usr/bin/python3
+"""A mesh is its cells and its names: however a file writes them, the signals are the same to the last digit."""
+import re
+import unittest
+
+import gmsh
+import meshio
+import numpy as np
+
+import pulmo_case as pulmo
+
+SCENE = pulmo.DIRECT + pulmo.PCV + ["-ventilator_pip", "3"]
+FLAVOURS = [(2.2, False), (2.2, True), (4.1, False), (4.1, True)]
+
+
+class Parts:
+    """Cells and named facets of a mesh, to be numbered and grouped anew and written as MSH 2.2 or 4.1 in letters."""
+
+    def __init__(self, name="cube_lung.msh"):
+        m = meshio.read(pulmo.mesh(name))
+        self.points = m.points
+        self.cells, self.facets = m.cells_dict["tetra"].copy(), m.cells_dict["triangle"].copy()
+        tags = m.cell_data_dict["gmsh:physical"]
+        name_of = {(dim, tag): text for text, (tag, dim) in m.field_data.items()}
+        # of each element: the names of its groups
+        self.cell_names = [[name_of[3, t]] for t in tags["tetra"]]
+        self.facet_names = [[name_of[2, t]] for t in tags["triangle"]]
+
+    def permute(self, random):
+        order = random.permutation(len(self.points))
+        number = np.empty_like(order)
+        number[order] = np.arange(len(order))
+        self.points = self.points[order]
+        for kind in "cells", "facets":
+            mix = random.permutation(len(getattr(self, kind)))
+            setattr(self, kind, number[getattr(self, kind)[mix]])
+            names = getattr(self, kind[:-1] + "_names")
+            setattr(self, kind[:-1] + "_names", [names[i] for i in mix])
+        for row in self.facets:
+            random.shuffle(row)
+        for row in self.cells:  # even and odd: half of the cells become left-handed
+            random.shuffle(row)
+
+    def write(self, tag_of, entity=lambda dim, tag: tag, names=None):
+        """MSH 2.2. tag_of: (dim, name) -> physical tag; an element of several groups is written for each."""
+        rows = []
+        for dim, kind, elements, groups in ((2, 2, self.facets, self.facet_names), (3, 4, self.cells, self.cell_names)):
+            for element, its in zip(elements, groups):
+                for tag in [tag_of[dim, g] for g in its] or [0]:
+                    rows.append(f"{kind} 2 {tag} {entity(dim, tag)} " + " ".join(str(n + 1) for n in element))
+        named = {(dim, abs(tag)): text for (dim, text), tag in tag_of.items()} if names is None else names
+        path = pulmo.scratch("mesh.msh")
+        with open(path, "w") as f:
+            f.write(f"$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$PhysicalNames\n{len(named)}\n")
+            f.writelines(f'{dim} {tag} "{text}"\n' for (dim, tag), text in named.items())
+            f.write(f"$EndPhysicalNames\n$Nodes\n{len(self.points)}\n")
+            f.writelines(f"{i} {x:.17g} {y:.17g} {z:.17g}\n" for i, (x, y, z) in enumerate(self.points, 1))
+            f.write(f"$EndNodes\n$Elements\n{len(rows)}\n")
+            f.writelines(f"{i} {row}\n" for i, row in enumerate(rows, 1))
+            f.write("$EndElements\n")
+        return path
+
+
+TAGS = {(2, "airway"): 1, (2, "pleura"): 2, (3, "lung"): 3}
+
+
+def in_gmsh(name, change, version, binary):
+    """The mesh `name` as gmsh writes it after change()."""
+    path = pulmo.scratch("mesh.msh")
+    gmsh.initialize()
+    try:
+        gmsh.option.setNumber("General.Terminal", 0)
+        gmsh.open(pulmo.mesh(name))
+        change()
+        gmsh.option.setNumber("Mesh.MshFileVersion", version)
+        gmsh.option.setNumber("Mesh.Binary", binary)
+        gmsh.write(path)
+    finally:
+        gmsh.finalize()
+    return path
+
+
+def partition(topology):
+    gmsh.option.setNumber("Mesh.PartitionCreateTopology", topology)
+    gmsh.option.setNumber("Mesh.PartitionCreatePhysicals", topology)
+    gmsh.option.setNumber("Mesh.PartitionCreateGhostCells", 1)
+    gmsh.model.mesh.partition(2)
+
+
+def group_again(tag_of, sign):
+    """The same groups with other tags; sign -1: their entities have the other orientation, which makes tags negative."""
+    groups = [(dim, tag, gmsh.model.getPhysicalName(dim, tag), gmsh.model.getEntitiesForPhysicalGroup(dim, tag))
+              for dim, tag in gmsh.model.getPhysicalGroups()]
+    gmsh.model.removePhysicalGroups()
+    for dim, tag, name, entities in groups:
+        gmsh.model.removePhysicalName(name)
+    for dim, tag, name, entities in groups:
+        gmsh.model.addPhysicalGroup(dim, [sign * e for e in entities], tag_of(tag))
+        gmsh.model.setPhysicalName(dim, tag_of(tag), name)
+
+
+def short_run(path, more=()):
+    return pulmo.finished(SCENE + ["-dm_plex_filename", path, "-ts_max_time", "0.15"] + list(more))
+
+
+def content(case):
+    with open(case.path("signals.csv"), "rb") as f:
+        return f.read()
+
+
+class TheSameMesh(unittest.TestCase):
+    def expect_same(self, path, reference, what, more=()):
+        with self.subTest(what):
+            case = short_run(path, more)
+            self.assertEqual(content(case), content(reference))
+            self.assertEqual(case.json()["surface_areas_mm2"], reference.json()["surface_areas_mm2"])
+            return case
+
+    def check_flavours(self, name):
+        plain = short_run(pulmo.mesh(name))
+        changes = {"plain": lambda: None, "partitioned": lambda: partition(0), "with the partitions' borders": lambda: partition(1),
+                   "reversed": lambda: group_again(lambda tag: tag, -1),
+                   # groups have the numbers of one another's entities
+                   "renumbered groups": lambda: group_again(lambda tag: tag % 3 + 1, 1)}
+        for version, binary in FLAVOURS if name == "cube_lung.msh" else FLAVOURS[:1] + FLAVOURS[-1:]:
+            for what, change in changes.items():
+                self.expect_same(in_gmsh(name, change, version, binary), plain, (name, version, binary, what))
+        mesh = meshio.read(pulmo.mesh(name))
+        for binary in False, True:
+            path = pulmo.scratch("mesh.msh")
+            meshio.write(path, mesh, file_format="gmsh22", binary=binary)
+            self.expect_same(path, plain, (name, "meshio", binary))
+
+    def test_the_cube(self):
+        self.check_flavours("cube_lung.msh")
+
+    def test_a_lung(self):
+        self.check_flavours("lung_test.msh")
+
+    def test_numbers_order_and_handedness(self):
+        plain = short_run(pulmo.mesh("cube_lung.msh"))
+        for seed in range(2):
+            parts = Parts()
+            parts.permute(np.random.default_rng(seed))
+            case = self.expect_same(parts.write(TAGS, entity=lambda dim, tag: tag % 3 + 1), plain, seed)
+            note = re.search(r"pulmo: note: (\d+) of 100 cells of the mesh are left-handed .*turned", case.out)
+            self.assertTrue(note, case.out)
+            self.assertTrue(30 < int(note.group(1)) < 70)
+
+    def test_groups(self):
+        """One lung in two groups, an airway in two groups of one name, tags with the sign of an orientation."""
+        plain = short_run(pulmo.mesh("cube_lung.msh"))
+        parts = Parts()
+        parts.cell_names = [["left"] if parts.points[c].mean(axis=0)[0] < 5 else ["right"] for c in parts.cells]
+        tags = TAGS | {(3, "left"): 7, (3, "right"): -9}
+        case = self.expect_same(parts.write(tags), plain, "two volumes")
+        regions = {name: r["reference_volume_ml"] for name, r in case.json()["regions"].items()}
+        x = parts.points[parts.cells]
+        volumes = np.abs(np.linalg.det(x[:, 1:] - x[:, :1])) / 6e3
+        left = np.array([names == ["left"] for names in parts.cell_names])
+        self.assertAlmostEqual(regions["left"], volumes[left].sum(), places=12)
+        self.assertAlmostEqual(regions["right"], volumes[~left].sum(), places=12)
+
+        parts = Parts()
+        parts.facet_names[0] = ["second"]
+        name = parts.facet_names[1][0]
+        tags = TAGS | {(2, "second"): 11}
+        path = parts.write(tags, names={(2, 1): "airway", (2, 2): "pleura", (3, 3): "lung", (2, 11): name})
+        self.assertEqual(name, "airway")
+        self.expect_same(path, plain, "two groups of one name")
+        self.expect_same(Parts().write({key: -tag for key, tag in TAGS.items()}), plain, "negative tags")
+
+    def test_a_group_without_a_name_is_its_number(self):
+        path = Parts().write(TAGS, names={(2, 2): "pleura"})
+        case = short_run(path, ["-airflow_surfaces", "1", "-chest_wall_surfaces", "1,pleura"])
+        self.assertEqual(set(case.json()["surface_areas_mm2"]), {"1", "pleura"})
+
+    def test_names_of_digits_are_told(self):
+        path = Parts().write(TAGS, names={(2, 1): "airway", (2, 2): "pleura", (3, 3): "5"})
+        case = short_run(path)
+        self.assertIn("pulmo: note: volume group 3 of the mesh has the name '5', not its number", case.out)
+
+
+class SeveralNames(unittest.TestCase):
+    def test_an_option_says_which_name_wins(self):
+        parts = Parts()
+        for names in parts.facet_names:
+            if "pleura" not in names:
+                names.append("pleura")
+        plain = short_run(pulmo.mesh("cube_lung.msh"))
+        case = short_run(parts.write(TAGS), ["-mesh_prefer", "airway"])
+        self.assertEqual(content(case), content(plain))
+        self.assertIn("14 facets (100 mm^2) in both 'airway' and 'pleura' are taken as 'airway'", case.out)
+        self.assertAlmostEqual(case.json()["surface_areas_mm2"]["pleura"], 500, places=9)
+
+    def test_a_cell_in_two_volumes_is_told(self):
+        parts = Parts()
+        for names in parts.cell_names[:10]:
+            names.append("lobe")
+        tags = TAGS | {(3, "lobe"): 9}
+        plain = short_run(pulmo.mesh("cube_lung.msh"))
+        case = short_run(parts.write(tags))
+        self.assertEqual(content(case), content(plain))
+        self.assertRegex(case.out, r"pulmo: note: 10 cells \(.* ml\) of the mesh are in several volumes \('lobe' and 'lung'\)")
+        regions = {name: r["reference_volume_ml"] for name, r in case.json()["regions"].items()}
+        self.assertAlmostEqual(regions["lung"], 1, places=12)
+        x = parts.points[parts.cells[:10]]
+        self.assertAlmostEqual(regions["lobe"], np.abs(np.linalg.det(x[:, 1:] - x[:, :1])).sum() / 6e3, places=12)
+
+
+class Cube22(unittest.TestCase):
+    """gmsh's own MSH 2.2, whose entities have the numbers of other groups."""
+
+    def test_entities_are_no_groups(self):
+        parts = Parts()
+        path = parts.write(TAGS, entity=lambda dim, tag: {2: {1: 2, 2: 1}, 3: {3: 1}}[dim][tag])
+        case = pulmo.finished(SCENE + ["-ventilator_expiration", "0.5", "-dm_plex_filename", path])
+        areas = case.json()["surface_areas_mm2"]
+        self.assertAlmostEqual(areas["airway"], 100, places=9)
+        self.assertAlmostEqual(areas["pleura"], 500, places=9)
+        self.assertAlmostEqual(case.json()["resistance_cmH2O_s_per_l"], 48.1, delta=0.05)
+
+
+class Distribution(unittest.TestCase):
+    def test_names_survive_ranks_and_refinement(self):
+        for name, airway, pleura in (("cube_lung.msh", 100, 500),):
+            for ranks, more in (2, ["-dm_refine", "1"]), (3, ["-dm_refine_pre", "1"]), (2, ["-petscpartitioner_type", "simple"]):
+                with self.subTest(name, ranks=ranks, more=more):
+                    case = pulmo.finished(SCENE + ["-dm_plex_filename", pulmo.mesh(name), "-ts_max_time", "0.05"] + more,
+                                          ranks=ranks)
+                    areas = case.json()["surface_areas_mm2"]
+                    self.assertAlmostEqual(areas["airway"], airway, places=9)
+                    self.assertAlmostEqual(areas["pleura"], pleura, places=9)
+
+
+if __name__ == "__main__":
+    pulmo.main()
