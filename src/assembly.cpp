@@ -183,7 +183,7 @@ PetscErrorCode Assembly::setup_facets()
       facets->cells = cells;
       PetscCall(
           ISCreateGeneral(PETSC_COMM_SELF, (PetscInt)faces.size(), faces.data(), PETSC_COPY_VALUES, faces_is.out()));
-      PetscCall(DMFieldCreateFEGeom(coordinates, faces_is, rule, PETSC_TRUE, &facets->geom));
+      PetscCall(compat::create_facet_geometry(coordinates, faces_is, rule, &facets->geom));
       // PETSc 3.18 gives the maps of the face itself. Gradients need the inverse map of the cell behind it (suppInvJ is
       // that of the face there), and x belongs to the basis functions, which are tabulated on the reference cell's
       // faces: set both from the cell.

@@ -103,6 +103,7 @@ int main(int argc, char **argv)
   if (code == 0) code = pulmo::initialize();
   if (code == 0) code = pulmo::run(pulmo::Registry::standard(), finished);
   int ends_with = exit_code(code, finished);
+  (void)pulmo::compat::leave_unused_options_to_pulmo();
   if (PetscFinalize() != 0 && ends_with == PULMO_FINISHED) ends_with = PULMO_COULD_NOT_GO_ON;
   MPI_Finalize();
   return ends_with;

@@ -56,7 +56,7 @@ PetscErrorCode Model::create_stock()
   PetscCall(DMGetLocalSection(dm_, &section));
   for (DMHandle *dm : {&stock_dm_, &rate_dm_}) {
     PetscCall(DMClone(mesh_->dm(), dm->out()));
-    PetscCall(DMCopyFields(dm_, *dm));
+    PetscCall(compat::copy_fields(dm_, *dm));
     PetscCall(DMCreateDS(*dm));
     PetscCall(DMSetLocalSection(*dm, section));
   }
@@ -292,7 +292,7 @@ PetscErrorCode Model::add_symmetries(PetscSection section) const
   PetscFunctionBeginUser;
   if (composition().elements().displacement < 3) PetscFunctionReturn(PETSC_SUCCESS);
   PetscCall(DMClone(mesh_->dm(), plain.out())); // PETSc knows them for the sections that it makes
-  PetscCall(DMCopyFields(dm_, plain));
+  PetscCall(compat::copy_fields(dm_, plain));
   PetscCall(DMCreateDS(plain));
   PetscCall(DMGetLocalSection(plain, &known));
   for (std::size_t f = 0; f < composition().fields().size(); ++f) {

@@ -11,7 +11,7 @@ namespace {
 /// METIS k-way partition of the dual graph. Only the rank that holds the mesh has vertices (as after reading a
 /// file); a graph that is spread over ranks is refused.
 PetscErrorCode partition_metis(PetscPartitioner partitioner, PetscInt n_parts, PetscInt n_vertices, PetscInt start[],
-                               PetscInt adjacency[], PetscSection, PetscSection, PetscSection section, IS *partition)
+                               PetscInt adjacency[], PULMO_PARTITION_WEIGHTS, PetscSection section, IS *partition)
 {
   const MPI_Comm comm = PetscObjectComm((PetscObject)partitioner);
   PetscInt holders = n_vertices > 0;

@@ -146,7 +146,7 @@ PetscErrorCode make_interpolation(DM dm, PetscInt block_size, Mat *P, MatNullSpa
     PetscCall(PetscSectionSetFieldConstraintIndices(coarse, p, 0, which));
   }
   PetscCall(DMGetPointSF(dm, &sf));
-  PetscCall(PetscSectionCreateGlobalSection(coarse, sf, PETSC_FALSE, PETSC_FALSE, coarse_global.out()));
+  PetscCall(compat::create_global_section(coarse, sf, coarse_global.out()));
   PetscCall(PetscSectionGetConstrainedStorageSize(fine_global, &rows));
   PetscCall(PetscSectionGetConstrainedStorageSize(coarse_global, &columns));
 
@@ -271,7 +271,7 @@ PetscErrorCode destroy_p_multigrid(PC pc)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode p_multigrid_options(PC pc, PetscOptionItems *PetscOptionsObject)
+PetscErrorCode p_multigrid_options(PC pc, compat::OptionItems PetscOptionsObject)
 {
   auto *self = static_cast<PMultigrid *>(pc->data);
 

@@ -214,6 +214,7 @@ Run::Run(const Registry &registry) : options_(PETSC_COMM_WORLD), scene_(registry
 PetscErrorCode Run::declare()
 {
   PetscFunctionBeginUser;
+  PetscCall(compat::settle_option_names(PETSC_COMM_WORLD));
   PetscCall(scene_.declare(options_));
   PetscCall(model_.declare(options_, scene_.facts().elements));
   PetscCall(simulation_.declare(options_));

@@ -186,7 +186,7 @@ PetscErrorCode Simulation::create_solver()
     PetscCall(PCSetOptionsPrefix(pc, "fieldsplit_displacement_"));
   }
   PetscCall(SNESSetComputeInitialGuess(snes, initial_guess, this));
-  PetscCall(TSSetFromOptions(ts_));
+  PetscCall(compat::set_from_options(ts_));
   PetscCall(offer_fixed_stress(ksp));
   PetscCall(lagging_.setup(snes));
   if (lagging_.in_use() || predictor_.in_use() ||

@@ -48,9 +48,150 @@ enum PulmoExitCode : int { PULMO_FINISHED = 0, PULMO_WRONG_INPUT = 1, PULMO_COUL
 
 namespace pulmo {
 
-/// Calls to PETSc whose arguments changed after 3.18; the overload that fits the installed PETSc is taken. (Only 3.18
-/// is tested.)
+// 3.24 renamed these types of functions and warns of the old names, which pulmo keeps for 3.18.
+#if PETSC_VERSION_GE(3, 24, 0)
+using PetscPointFunc = PetscPointFn *;
+using PetscPointJac = PetscPointJacFn *;
+using PetscBdPointFunc = PetscBdPointFn *;
+using PetscBdPointJac = PetscBdPointJacFn *;
+#endif
+
+/// What changed in PETSc after 3.18, up to 3.25: arguments of calls, names of types and of options.
 namespace compat {
+
+/// What PC types read their options from.
+#if PETSC_VERSION_LT(3, 23, 0)
+using OptionItems = PetscOptionItems *;
+#else
+using OptionItems = PetscOptionItems;
+#endif
+
+/// What a partitioner is handed of weights, before the section of its result: 3.21 added those of edges.
+#if PETSC_VERSION_LT(3, 21, 0)
+#define PULMO_PARTITION_WEIGHTS PetscSection, PetscSection
+#else
+#define PULMO_PARTITION_WEIGHTS PetscSection, PetscSection, PetscSection
+#endif
+
+inline PetscErrorCode create_global_section(PetscSection local, PetscSF sf, PetscSection *global)
+{
+#if PETSC_VERSION_LT(3, 21, 0)
+  return PetscSectionCreateGlobalSection(local, sf, PETSC_FALSE, PETSC_FALSE, global);
+#else
+  return PetscSectionCreateGlobalSection(local, sf, PETSC_TRUE, PETSC_FALSE, PETSC_FALSE, global);
+#endif
+}
+
+/// All fields, of any degree.
+inline PetscErrorCode copy_fields(DM from, DM to)
+{
+#if PETSC_VERSION_LT(3, 22, 0)
+  return DMCopyFields(from, to);
+#else
+  return DMCopyFields(from, PETSC_DETERMINE, PETSC_DETERMINE, to);
+#endif
+}
+
+/// The geometry of facets of the boundary.
+inline PetscErrorCode create_facet_geometry(DMField coordinates, IS facets, PetscQuadrature rule,
+                                            PetscFEGeom **geometry)
+{
+#if PETSC_VERSION_LT(3, 23, 0)
+  return DMFieldCreateFEGeom(coordinates, facets, rule, PETSC_TRUE, geometry);
+#else
+  return DMFieldCreateFEGeom(coordinates, facets, rule, PETSC_FEGEOM_BOUNDARY, geometry);
+#endif
+}
+
+/// Lets a KSP keep its matrix where its DM could make one.
+inline PetscErrorCode keep_operators(KSP ksp)
+{
+#if PETSC_VERSION_LT(3, 25, 0)
+  return KSPSetDMActive(ksp, PETSC_FALSE);
+#else
+  return KSPSetDMActive(ksp, KSP_DMACTIVE_ALL, PETSC_FALSE);
+#endif
+}
+
+/// An option, or the value of one, with another name in later releases.
+struct RenamedOption {
+  const char *name, *later; ///< pulmo's files and docs say @p name
+  bool later_here;          ///< this PETSc knows @p later only
+};
+inline constexpr RenamedOption renamed_options[] = {
+    {"-ts_dt", "-ts_time_step", PETSC_VERSION_GE(3, 25, 0)},
+    {"-ts_max_reject", "-ts_max_step_rejections", PETSC_VERSION_GE(3, 25, 0)},
+    {"-snes_linesearch_maxstep", "-snes_linesearch_maxlambda", PETSC_VERSION_GE(3, 24, 0)}};
+inline constexpr RenamedOption renamed_line_search = {"l2", "secant", PETSC_VERSION_GE(3, 24, 0)};
+
+/// Moves the value of option @p from to @p to. Both given: an error, since the database forgets which came last.
+inline PetscErrorCode move_option(MPI_Comm comm, const char *from, const char *to)
+{
+  char value[4096] = "";
+  PetscBool given, both;
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscOptionsHasName(nullptr, nullptr, from, &given));
+  if (!given) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(PetscOptionsHasName(nullptr, nullptr, to, &both));
+  PulmoUserCheck(
+      !both, comm,
+      "options %s and %s are two names of the same, and an option file may give the first; write %s everywhere", to,
+      from, to);
+  PetscCall(PetscOptionsGetString(nullptr, nullptr, from, value, sizeof(value), nullptr));
+  PetscCall(PetscOptionsSetValue(nullptr, to, value[0] ? value : nullptr));
+  PetscCall(PetscOptionsClearValue(nullptr, from));
+  PetscCall(PetscOptionsHasName(nullptr, nullptr, to, &given)); // that is use enough for -options_left
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Changes the type of the line search from one name to the other.
+inline PetscErrorCode rename_line_search(const char *from, const char *to)
+{
+  char value[64] = "";
+  PetscBool same;
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscOptionsGetString(nullptr, nullptr, "-snes_linesearch_type", value, sizeof(value), nullptr));
+  PetscCall(PetscStrcmp(value, from, &same));
+  if (same) PetscCall(PetscOptionsSetValue(nullptr, "-snes_linesearch_type", to));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Options that a user gave by their later names get those that pulmo knows.
+inline PetscErrorCode settle_option_names(MPI_Comm comm)
+{
+  PetscFunctionBeginUser;
+  for (const RenamedOption &option : renamed_options) PetscCall(move_option(comm, option.later, option.name));
+  PetscCall(rename_line_search(renamed_line_search.later, renamed_line_search.name));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Keeps later releases from listing unused options at the end unasked: pulmo tells of them itself.
+inline PetscErrorCode leave_unused_options_to_pulmo()
+{
+  PetscBool given;
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscOptionsHasName(nullptr, nullptr, "-options_left", &given));
+  if (!given) PetscCall(PetscOptionsSetValue(nullptr, "-options_left", "no"));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// TSSetFromOptions, which finds the options by the names that this PETSc knows.
+inline PetscErrorCode set_from_options(TS ts)
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)ts);
+
+  PetscFunctionBeginUser;
+  for (const RenamedOption &option : renamed_options)
+    if (option.later_here) PetscCall(move_option(comm, option.name, option.later));
+  if (renamed_line_search.later_here)
+    PetscCall(rename_line_search(renamed_line_search.name, renamed_line_search.later));
+  PetscCall(TSSetFromOptions(ts));
+  PetscCall(settle_option_names(comm));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
 
 #define PULMO_FE_ARGUMENTS                                                                                             \
   PetscFormKey key, PetscInt n, PetscFEGeom *geom, const PetscScalar *u, const PetscScalar *u_t, PetscReal t,          \

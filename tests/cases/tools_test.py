@@ -4,6 +4,7 @@ import csv
 import json
 import os
 import pathlib
+import shutil
 import subprocess
 import sys
 import unittest
@@ -13,6 +14,8 @@ import numpy as np
 import pulmo_case as pulmo
 
 sys.path.insert(0, os.path.join(pulmo.SOURCE, "tools"))
+sys.path.insert(0, os.path.join(pulmo.SOURCE, "tests/support"))
+import failed_tests  # noqa: E402
 from benchmarks import assembly, common, keys, memory, operations, scaling  # noqa: E402
 from hardcases import gallery, page  # noqa: E402
 
@@ -33,6 +36,56 @@ def tet_volumes(x, cells):
 def table(path):
     with open(path, newline="") as f:
         return list(csv.DictReader(f))
+
+
+class TestTool(unittest.TestCase):
+    """tools/test in a tree of its own, with a set-up that does nothing and tests that fail on purpose."""
+
+    @classmethod
+    def setUpClass(cls):
+        cls.root = pathlib.Path(pulmo.scratch("tree"))
+        for name in "tools", "tests/support", "build":
+            (cls.root / name).mkdir(parents=True)
+        for name in "tools/test", "tests/support/failed_tests.py":
+            shutil.copy(os.path.join(pulmo.SOURCE, name), cls.root / name)
+        (cls.root / "tools/setup").write_text('#!/bin/bash\necho "setup got $*"\n')
+        (cls.root / "tools/setup").chmod(0o755)
+        (cls.root / "script.py").write_text(
+            "import unittest\nclass C(unittest.TestCase):\n"
+            "    def test_one(self):\n        for law in 'berger', 'ma':\n            with self.subTest(law): self.assertEqual(law, 'ma')\n"
+            "    def test_two(self): 'A line about it.'; 1 / 0\n    def test_three(self): pass\nunittest.main()\n")
+        (cls.root / "build/CTestTestfile.cmake").write_text(
+            f'add_test(good "/bin/true")\nadd_test(script "{sys.executable}" "{cls.root}/script.py")\n'
+            'add_test(cpp "/bin/sh" "-c" "echo; echo \'[  FAILED  ] Suite.Name (3 ms)\'; echo \'[  FAILED  ] Suite.Name\'; exit 1")\n'
+            'add_test(gone "/no/such/program")\n')
+
+    def run_tests(self, *arguments):
+        return subprocess.run([self.root / "tools/test", *arguments], capture_output=True, text=True, timeout=60)
+
+    def test_names_what_failed_and_how_to_run_it(self):
+        run = self.run_tests()
+        self.assertEqual(run.returncode, 8, run.stdout + run.stderr)  # ctest's own
+        self.assertIn("setup got -DPULMO_WERROR=ON", run.stdout)
+        self.assertIn("25% tests passed, 3 tests failed out of 4", run.stdout)
+        lines = run.stdout.splitlines()[-4:]
+        self.assertEqual(set(lines[0].split()), set("test: 3 failed: script cpp gone".split()), run.stdout)
+        self.assertEqual(set(lines[1:]), {
+            "test: script (test_two, test_one [berger]); alone: tools/test -R '^script$'",
+            "test: cpp (Suite.Name); alone: tools/test -R '^cpp$'",
+            "test: gone; alone: tools/test -R '^gone$'"})
+
+    def test_arguments_and_success(self):
+        run = self.run_tests("-R", "^good$")
+        self.assertEqual(run.returncode, 0, run.stdout + run.stderr)
+        self.assertIn("100% tests passed, 0 tests failed out of 1", run.stdout)
+        self.assertNotIn("test:", run.stdout)
+        run = self.run_tests("-R", "^cpp$")
+        self.assertEqual(run.returncode, 8)
+        self.assertEqual(run.stdout.splitlines()[-2:], ["test: 1 failed: cpp", "test: cpp (Suite.Name); alone: tools/test -R '^cpp$'"])
+        # what failed before is not said again
+        (self.root / "started").touch()
+        self.assertEqual(failed_tests.lines(self.root / "build", self.root / "started"),
+                         ["test: ctest failed without naming a test; see above"])
 
 
 class Tools(unittest.TestCase):

@@ -93,7 +93,7 @@ int iterations(const std::string &mesh, const std::string &more)
     PetscCall(VecSetRandom(b, nullptr));
     PetscCall(KSPCreate(PETSC_COMM_WORLD, &ksp));
     PetscCall(KSPSetDM(ksp, run.model().dm()));
-    PetscCall(KSPSetDMActive(ksp, PETSC_FALSE));
+    PetscCall(pulmo::compat::keep_operators(ksp));
     PetscCall(KSPSetOperators(ksp, A, A));
     PetscCall(KSPSetOptionsPrefix(ksp, "test_"));
     PetscCall(KSPSetTolerances(ksp, 1e-8, PETSC_DEFAULT, PETSC_DEFAULT, 2000));

@@ -115,7 +115,7 @@ def time_shares(program, arguments, folder):
 def build(folder):
     """The benchmark program for x86-64-v3 in `folder`."""
     print("building for x86-64-v3 ...", flush=True)
-    for command in (["cmake", "-S", SOURCE, "-B", folder, "-DCMAKE_BUILD_TYPE=Release", "-DPULMO_NATIVE=OFF", "-DPULMO_TESTS=OFF",
+    for command in (["cmake", "-S", SOURCE, "-B", folder, "-DCMAKE_BUILD_TYPE=Release", "-DPULMO_ARCH=x86-64-v3", "-DPULMO_TESTS=OFF",
                      "-DCMAKE_CXX_FLAGS=-march=x86-64-v3 -mtune=native"],
                     ["cmake", "--build", folder, "--parallel", "2", "--target", "pulmo_assembly_benchmark"]):
         if subprocess.run([str(c) for c in command], stdout=subprocess.DEVNULL).returncode:

@@ -1,0 +1,33 @@
+# cmake --install: program, library with its CMake package, tools, docs. Tools find meshes and option files beside
+# them, as in the source tree.
+include(CMakePackageConfigHelpers)
+set(package ${CMAKE_INSTALL_LIBDIR}/cmake/pulmo)
+set(data ${CMAKE_INSTALL_DATADIR}/pulmo)
+
+# PETSc and MPI may stand where the system's loader does not look
+file(RELATIVE_PATH to_libraries ${CMAKE_INSTALL_FULL_BINDIR} ${CMAKE_INSTALL_FULL_LIBDIR})
+set_target_properties(pulmo pulmo_library PROPERTIES INSTALL_RPATH_USE_LINK_PATH ON)
+set_target_properties(pulmo PROPERTIES INSTALL_RPATH "$ORIGIN/${to_libraries}")
+
+install(TARGETS pulmo RUNTIME)
+install(TARGETS pulmo_library EXPORT pulmo)
+install(EXPORT pulmo FILE pulmo-targets.cmake NAMESPACE pulmo:: DESTINATION ${package})
+configure_package_config_file(${CMAKE_CURRENT_LIST_DIR}/pulmo-config.cmake.in ${PROJECT_BINARY_DIR}/pulmo-config.cmake
+                              INSTALL_DESTINATION ${package})
+write_basic_package_version_file(${PROJECT_BINARY_DIR}/pulmo-config-version.cmake COMPATIBILITY SameMinorVersion)
+install(FILES ${PROJECT_BINARY_DIR}/pulmo-config.cmake ${PROJECT_BINARY_DIR}/pulmo-config-version.cmake
+              ${CMAKE_CURRENT_LIST_DIR}/Dependencies.cmake ${CMAKE_CURRENT_LIST_DIR}/FindPETSc.cmake
+        DESTINATION ${package})
+install(DIRECTORY include/pulmo DESTINATION ${CMAKE_INSTALL_INCLUDEDIR})
+
+install(DIRECTORY petsc_options meshes DESTINATION ${data})
+install(PROGRAMS tools/report tools/lung_mesh tools/sphere_mesh tools/accuracy_cost tools/reproduce_paper
+        DESTINATION ${data}/tools)
+install(DIRECTORY tools/accuracy tools/benchmarks DESTINATION ${data}/tools FILES_MATCHING PATTERN "*.py")
+install(FILES docs/paper/page.md.in DESTINATION ${data}/docs/paper)
+# the tools' build/pulmo is the installed program
+file(RELATIVE_PATH to_program ${CMAKE_INSTALL_FULL_DATADIR}/pulmo ${CMAKE_INSTALL_FULL_BINDIR})
+install(CODE "file(CREATE_LINK \"${to_program}\" \"\$ENV{DESTDIR}\${CMAKE_INSTALL_PREFIX}/${data}/build\" SYMBOLIC)")
+
+install(FILES README.md LICENSE DESTINATION ${CMAKE_INSTALL_DOCDIR})
+install(DIRECTORY docs/ DESTINATION ${CMAKE_INSTALL_DOCDIR}/docs PATTERN "*.in" EXCLUDE)
