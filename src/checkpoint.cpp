@@ -24,15 +24,49 @@ namespace fs = std::filesystem;
 constexpr std::array<const char *, 11> free_prefixes{"-mesh",       "-ventilator", "-predictor",     "-newton",
                                                      "-step",       "-output",     "-progress",      "-effects",
                                                      "-checkpoint", "-restart",    "-error_estimate"};
+/// Prefixes of options that change no number but rounding, and of what is compared by itself.
+constexpr std::array<const char *, 18> aside{
+    "-mesh",    "-ventilator",  "-output",  "-progress",     "-effects",           "-checkpoint",
+    "-restart", "-ts_max_time", "-options", "-dm_plex",      "-petscpartitioner",  "-log",
+    "-malloc",  "-info",        "-help",    "-skip_petscrc", "-no_signal_handler", "-error_estimate"};
 constexpr const char *flow_split = "-ventilator_flow_split"; // no part of the programme
 
-bool is_free(const std::string &option)
+template <class List>
+bool begins_with_one_of(const List &prefixes, const std::string &option)
 {
-  if (option == flow_split) return false;
-  return std::any_of(free_prefixes.begin(), free_prefixes.end(), [&](const char *prefix) {
+  return std::any_of(prefixes.begin(), prefixes.end(), [&](const char *prefix) {
     const std::size_t n = std::strlen(prefix);
     return option.compare(0, n, prefix) == 0 && (option.size() == n || option[n] == '_');
   });
+}
+
+bool is_free(const std::string &option)
+{
+  return option != flow_split && begins_with_one_of(free_prefixes, option);
+}
+
+std::string text_of(const OptionList &list)
+{
+  std::string text;
+  for (const auto &[name, value] : list) text += name + " " + value + "\n";
+  return text;
+}
+
+OptionList read_options(const std::string &text)
+{
+  OptionList list;
+  std::istringstream lines(text);
+  for (std::string line; std::getline(lines, line);) {
+    const std::size_t space = line.find(' ');
+    if (space != std::string::npos) list.emplace_back(line.substr(0, space), line.substr(space + 1));
+  }
+  return list;
+}
+
+std::optional<std::string> value_in(const OptionList &list, const std::string &name)
+{
+  const auto found = std::find_if(list.begin(), list.end(), [&](const auto &entry) { return entry.first == name; });
+  return found == list.end() ? std::optional<std::string>() : found->second;
 }
 
 /// Makes a directory's entries survive a loss of power, as far as its file system can.
@@ -127,6 +161,7 @@ PetscErrorCode Checkpoint::write(std::string &complaint)
   PetscCall(Archive::create(model_, order_, archive));
   PetscCall(persist_scene(*archive));
   PetscCall(simulation_.persist(*archive));
+  PetscCall(persist_numerics(*archive));
   PetscCall(archive->finish(image));
   archive.reset();
   if (rank == 0) {
@@ -154,6 +189,7 @@ PetscErrorCode Checkpoint::restore()
   PetscCall(Archive::open(model_, order_, "-restart", restart_, archive));
   PetscCall(persist_scene(*archive));
   PetscCall(simulation_.persist(*archive));
+  PetscCall(persist_numerics(*archive));
   schedule_->skip(simulation_.time());
   spare_previous_ = fs::path(restart_).filename() == "checkpoint_previous.h5";
   PetscCall(
@@ -173,8 +209,9 @@ PetscErrorCode Checkpoint::persist_scene(Archive &archive)
                  "-dm_plex_filename and -mesh_scale",
                  restart_.c_str(), mesh.c_str(), order_.identity().c_str());
   PetscCall(persist_names(archive));
-  for (const auto &[name, value] : options_.own_used())
-    if (!is_free(name)) options += name + " " + value + "\n";
+  OptionList own = options_.own_used();
+  own.erase(std::remove_if(own.begin(), own.end(), [](const auto &o) { return is_free(o.first); }), own.end());
+  options = text_of(own);
   PetscCall(archive.text("options", options));
   if (archive.reading()) PetscCall(compare_options(options));
   PetscCall(persist_programme(archive));
@@ -200,19 +237,9 @@ PetscErrorCode Checkpoint::persist_names(Archive &archive)
 
 PetscErrorCode Checkpoint::compare_options(const std::string &stored) const
 {
-  OptionList then;
-  const auto now = options_.own_used();
-  std::istringstream lines(stored);
+  const OptionList then = read_options(stored), now = options_.own_used();
 
   PetscFunctionBeginUser;
-  for (std::string line; std::getline(lines, line);) {
-    const std::size_t space = line.find(' ');
-    if (space != std::string::npos) then.emplace_back(line.substr(0, space), line.substr(space + 1));
-  }
-  const auto value_in = [](const auto &list, const std::string &name) {
-    const auto found = std::find_if(list.begin(), list.end(), [&](const auto &entry) { return entry.first == name; });
-    return found == list.end() ? std::optional<std::string>() : found->second;
-  };
   const auto refuse = [&](const std::string &name) -> PetscErrorCode {
     const auto text = [&](const auto &list) { return value_in(list, name).value_or("(not in use)"); };
     PetscFunctionBeginUser;
@@ -227,6 +254,40 @@ PetscErrorCode Checkpoint::compare_options(const std::string &stored) const
   }
   for (const auto &[name, value] : now) // an earlier pulmo did not have all options, and did what is the default now
     if (!is_free(name) && !value_in(then, name) && !options_.at_default(name)) PetscCall(refuse(name));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Checkpoint::persist_numerics(Archive &archive)
+{
+  OptionList now;
+  std::string text;
+
+  PetscFunctionBeginUser;
+  PetscCall(options_.all_used(now));
+  now.erase(std::remove_if(now.begin(), now.end(),
+                           [](const auto &o) { return begins_with_one_of(aside, o.first) || prints(o.first); }),
+            now.end());
+  text = text_of(now);
+  PetscCall(archive.text("numerics", text));
+  PetscCall(archive.text("numerics_changed", numerics_changed_));
+  if (!archive.reading() || !numerics_changed_.empty()) PetscFunctionReturn(PETSC_SUCCESS);
+  const OptionList then = read_options(text);
+  const auto compare = [&](const OptionList &list, const OptionList &other) {
+    for (const auto &[name, value] : list) {
+      const auto elsewhere = value_in(other, name);
+      if (!numerics_changed_.empty() || (elsewhere && Options::same_value(value, *elsewhere))) continue;
+      const auto told = [&](const OptionList &l) {
+        const auto known = value_in(l, name);
+        return known ? "'" + *known + "'" : "not given";
+      };
+      std::ostringstream sentence;
+      sentence << name << " was " << told(then) << " until t = " << simulation_.time() << " s and " << told(now)
+               << " after it";
+      numerics_changed_ = sentence.str();
+    }
+  };
+  compare(then, now);
+  compare(now, then);
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

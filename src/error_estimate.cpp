@@ -44,14 +44,11 @@ constexpr const char *viewer_ends[] = {"_view", "_view_pre", "_monitor", "_conve
 
 bool is_output_option(const std::string &name)
 {
-  const auto ends = [&](const std::string &end) {
-    return name.size() > end.size() && name.compare(name.size() - end.size(), end.size(), end) == 0;
-  };
-  if (std::any_of(std::begin(viewer_ends), std::end(viewer_ends), ends) || name.find("_monitor_") != std::string::npos)
-    return true;
-  return std::any_of(std::begin(output_prefixes), std::end(output_prefixes), [&](const std::string &prefix) {
-    return name.compare(0, prefix.size(), prefix) == 0 && (name.size() == prefix.size() || name[prefix.size()] == '_');
-  });
+  return prints(name) ||
+         std::any_of(std::begin(output_prefixes), std::end(output_prefixes), [&](const std::string &prefix) {
+           return name.compare(0, prefix.size(), prefix) == 0 &&
+                  (name.size() == prefix.size() || name[prefix.size()] == '_');
+         });
 }
 
 std::string text_of(double v)
@@ -214,6 +211,15 @@ ErrorBar error_bar(const std::vector<ErrorLevel> &levels, std::size_t i, int ord
 
 } // namespace
 
+bool prints(const std::string &option)
+{
+  const auto ends = [&](const std::string &end) {
+    return option.size() > end.size() && option.compare(option.size() - end.size(), end.size(), end) == 0;
+  };
+  return std::any_of(std::begin(viewer_ends), std::end(viewer_ends), ends) ||
+         option.find("_monitor_") != std::string::npos;
+}
+
 TimeError time_error(double fine, double twice, double four_times, int order)
 {
   const double near = fine - twice, far = twice - four_times;
@@ -268,6 +274,16 @@ PetscErrorCode ErrorEstimate::check(const Options &options, const Scene &scene) 
   PulmoUserCheck(scene.facts().ventilator, options.comm(),
                  "-error_estimate gives the errors of clinical numbers: it needs -ventilator");
   if (!mesh_.empty()) PetscCall(check_mesh_file(options.comm(), "-error_estimate_mesh", mesh_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode ErrorEstimate::check_sessions(const Options &options, const std::string &changed) const
+{
+  PetscFunctionBeginUser;
+  PulmoUserCheck(!in_use_ || changed.empty(), options.comm(),
+                 "-error_estimate judges a run by its steps and tolerances, and those of this one changed at a restart "
+                 "(%s): leave it out, or run from the start",
+                 changed.c_str());
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -310,6 +310,7 @@ PetscErrorCode run(const Registry &registry, bool &finished)
   PetscCall(warn_of_equal_order(comm, scene, run.model(), simulation.wanted_dt(), warned_of_elements));
   const bool restarts = !checkpoint.restart().empty();
   if (restarts) PetscCall(checkpoint.restore());
+  PetscCall(error_estimate.check_sessions(options, checkpoint.numerics_changed()));
   PetscCall(output.prepare(options, checkpoint.restart(), fields.files()));
   if (restarts) PetscCall(fields.carry_over(checkpoint.restart_directory()));
   {

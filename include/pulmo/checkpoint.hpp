@@ -24,6 +24,10 @@ public:
   /// Reads it into the simulation and its observers. Refuses a checkpoint of another mesh or scene. Touches no file.
   PetscErrorCode restore();
 
+  /// The first option of the steps and the solver that changed between the sessions of this run, as in "-ts_dt was
+  /// '0.1' until t = 0.2 s and '0.05' after it"; empty if none did, or the run began at rest.
+  const std::string &numerics_changed() const { return numerics_changed_; }
+
   PetscErrorCode observe(const StepReport &step) override;
   /// Writes a checkpoint after the last accepted step. @p complaint: why it could not, or empty; the older ones are
   /// then as they were.
@@ -36,6 +40,8 @@ private:
   /// Which facets and cells have which names.
   PetscErrorCode persist_names(Archive &archive);
   PetscErrorCode compare_options(const std::string &stored) const;
+  /// What a restart may change of steps and solver: read to know whether it did.
+  PetscErrorCode persist_numerics(Archive &archive);
   PetscErrorCode persist_programme(Archive &archive);
   PetscErrorCode compare_programme(const std::vector<Phase> &stored, PetscReal time) const;
 
@@ -46,7 +52,7 @@ private:
   Simulation &simulation_;
   NodeOrder order_;
   PetscReal every_ = 0;
-  std::string restart_;
+  std::string restart_, numerics_changed_;
   std::optional<Schedule> schedule_;
   bool spare_previous_ = false; ///< the run came from checkpoint_previous.h5: the one after it may be bad
 };

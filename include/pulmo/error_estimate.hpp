@@ -12,6 +12,9 @@ class Registry;
 class Scene;
 class Simulation;
 
+/// Whether an option of PETSc's prints or writes, and changes nothing else.
+bool prints(const std::string &option);
+
 /// What the steps make a number wrong by.
 struct TimeError {
   double error;                ///< in the number's unit, not negative
@@ -69,6 +72,9 @@ public:
   bool in_use() const { return in_use_; }
   /// Before the run: refuses a scene that has no clinical numbers, and a mesh that cannot be read.
   PetscErrorCode check(const Options &options, const Scene &scene) const;
+  /// Refuses a run whose steps or solver @p changed at a restart (Checkpoint::numerics_changed): all bars are made of
+  /// the options of its last session.
+  PetscErrorCode check_sessions(const Options &options, const std::string &changed) const;
   /// After the run: @p numbers are its own. A level that cannot be finished leaves parts empty.
   PetscErrorCode make(const Options &options, const Output &output, const Scene &scene, const Simulation &simulation,
                       const std::vector<ClinicalEntry> &numbers, ErrorReport &report) const;

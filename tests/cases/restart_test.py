@@ -271,6 +271,33 @@ class Agreement(RestartCase):
                          SAME_RANKS)
 
 
+class ErrorBars(RestartCase):
+    """Bars are made of the steps and the solver of the last session: they have to be those of the whole run."""
+
+    def refused(self, start, options, *words, ranks=1):
+        case = pulmo.Case(PCV + ["-error_estimate", "-restart", start.path("checkpoint.h5")] + options, ranks=ranks)
+        self.expect_error(case.code, case.err, "-error_estimate", "changed at a restart", "run from the start", *words)
+        self.assertFalse(os.path.exists(case.directory), "something was touched")
+
+    def test_changed_steps_and_solver(self):
+        start = pulmo.finished(PCV + ["-checkpoint_every", "0.1", "-ts_max_time", "0.2"])
+        for options, words in ((["-ts_dt", "0.025"], "-ts_dt was '0.05' until t = 0.2 s and '0.025' after it"),
+                               (["-snes_rtol", "1e-6"], "-snes_rtol was '1e-14' until t = 0.2 s and '1e-6' after it"),
+                               (["-pc_type", "jacobi"], "-pc_type was 'lu' until"),
+                               (["-step_volume_tolerance", "0.5"], "-step_volume_tolerance was '0' until"),
+                               (["-snes_lag_jacobian", "2"], "-snes_lag_jacobian was not given until")):
+            with self.subTest(words):
+                self.refused(start, options, words, ranks=2 if options[0] == "-ts_dt" else 1)
+        # it is remembered
+        middle = pulmo.finished(PCV + ["-ts_dt", "0.025", "-ts_max_time", "0.3", "-checkpoint_every", "0.1",
+                                       "-restart", start.path("checkpoint.h5")])
+        self.refused(middle, [], "-ts_dt was '0.05' until t = 0.2 s and '0.025' after it")
+        # what changes no number may change
+        free = ["-ts_max_time", "0.6", "-snes_monitor", "-output_fields_every", "0.3", "-snes_rtol", "1.0e-14", "-mesh_scale", "1.0"]
+        made = pulmo.finished(PCV + free + ["-error_estimate", "-restart", start.path("checkpoint.h5")])
+        self.assertIsNotNone(made.json()["error_estimate"]["numbers"]["tidal_volume_ml"]["time"])
+
+
 class Meshes(RestartCase):
     """Nodes are told apart by where they are, not by their numbers."""
 
