@@ -133,6 +133,29 @@ class Tools(unittest.TestCase):
         self.assertIn("volume", made.stderr)
         self.assertNotIn("Traceback", made.stderr)
 
+    def test_meshes_of_absurd_sizes(self):
+        """One sentence, at once, and no file."""
+        fine = {"sphere_mesh": ["--divisions", "2", "--layers", "2"], "lung_mesh": []}
+        for name, words, told in (("lung_mesh", ["--volume", "0"], "--volume"), ("lung_mesh", ["--volume", "nan"], "--volume"),
+                                  ("lung_mesh", ["--volume", "1e-9"], "--volume 1e-09 ml"), ("lung_mesh", ["--volume", "1e12"], "--volume 1e+12 ml"),
+                                  ("lung_mesh", ["--size", "1e-6"], "--size 1e-06 mm"), ("lung_mesh", ["--size", "1e6"], "--size 1e+06 mm"),
+                                  ("lung_mesh", ["--airway-size", "1e-6"], "--airway-size 1e-06 mm"), ("lung_mesh", ["--size", "-1"], "--size"),
+                                  ("lung_mesh", ["--cells", "1000000000"], "--cells 1000000000"), ("lung_mesh", ["--cells", "1"], "--cells 1 "),
+                                  ("sphere_mesh", ["--divisions", "0"], "--divisions 0"), ("sphere_mesh", ["--layers", "-3"], "--layers -3"),
+                                  ("sphere_mesh", ["--divisions", "100000"], "tetrahedra, which take"),
+                                  ("sphere_mesh", ["--layers", "1000000000"], "tetrahedra, which take"),
+                                  ("sphere_mesh", ["--inner", "1e-9", "--outer", "1e-8"], "--inner 1e-09"),
+                                  ("sphere_mesh", ["--inner", "nan"], "--inner nan"), ("sphere_mesh", ["--outer", "inf"], "--outer inf"),
+                                  ("sphere_mesh", ["--outer", "7.500001"], "as good as flat"), ("sphere_mesh", ["--divisions", "nan"], "--divisions")):
+            with self.subTest(tool=name, words=words):
+                folder = os.path.dirname(pulmo.scratch())
+                refused = tool(name, *fine[name], *words, "--output", os.path.join(folder, "made.msh"))
+                self.assertIn(refused.returncode, (1, 2))
+                self.assertTrue(refused.stderr.startswith(f"{name}: "), refused.stderr)
+                self.assertIn(told, refused.stderr)
+                self.assertEqual(len(refused.stderr.splitlines()), 1, refused.stderr)
+                self.assertEqual(os.listdir(folder), [])
+
     def test_report_draws(self):
         case = pulmo.finished(pulmo.DIRECT + pulmo.PCV + pulmo.CUBE + ["-ts_max_time", "0.1"])
         drawn = tool("report", case.directory)
