@@ -11,170 +11,244 @@ namespace pulmo {
 
 namespace {
 
-/// body[vertex - begin]: a number that all vertices of one connected body share, on all ranks.
-PetscErrorCode find_bodies(DM dm, PetscInt begin, PetscInt end, std::vector<PetscInt> &body)
+/// of[cell - begin]: a number that all cells of one connected body share, on all ranks. Bodies are joined by facets.
+PetscErrorCode number_bodies(DM dm, PetscInt begin, PetscInt end, std::vector<PetscInt> &of)
 {
   const MPI_Comm comm = PetscObjectComm((PetscObject)dm);
-  PetscInt cell_begin, cell_end, point_end, roots, changed = 1;
+  PetscInt face_begin, face_end, point_end, roots, changed = 1, first = 0;
+  const PetscInt n = end - begin;
   PetscSF sf;
-  IS numbering;
-  const PetscInt *numbers;
 
   PetscFunctionBeginUser;
   PetscCall(DMPlexGetChart(dm, nullptr, &point_end));
-  PetscCall(DMPlexGetHeightStratum(dm, 0, &cell_begin, &cell_end));
-  PetscCall(DMPlexGetVertexNumbering(dm, &numbering));
-  PetscCall(ISGetIndices(numbering, &numbers));
-  std::vector<PetscInt> of(static_cast<std::size_t>(point_end), PETSC_MAX_INT), sent;
-  for (PetscInt v = begin; v < end; ++v)
-    of[v] = numbers[v - begin] < 0 ? -(numbers[v - begin] + 1) : numbers[v - begin];
-  PetscCall(ISRestoreIndices(numbering, &numbers));
+  PetscCall(DMPlexGetHeightStratum(dm, 1, &face_begin, &face_end));
+  PetscCallMPI(MPI_Exscan(&n, &first, 1, MPIU_INT, MPI_SUM, comm));
 
-  // vertices joined by cells of this rank: a tree for each body, known by its root
-  std::vector<PetscInt> parent(static_cast<std::size_t>(point_end));
+  // cells joined on this rank: a tree for each body, known by its root
+  std::vector<PetscInt> parent(static_cast<std::size_t>(n));
   std::iota(parent.begin(), parent.end(), 0);
-  const auto root = [&](PetscInt v) {
-    while (parent[v] != v) v = parent[v] = parent[parent[v]];
-    return v;
+  const auto root = [&](PetscInt c) {
+    while (parent[c] != c) c = parent[c] = parent[parent[c]];
+    return c;
   };
-  for (PetscInt c = cell_begin; c < cell_end; ++c) {
-    PetscInt *closure = nullptr, n;
-    PetscCall(DMPlexGetTransitiveClosure(dm, c, PETSC_TRUE, &n, &closure));
-    const PetscInt joined = root(closure[2 * (n - 1)]); // vertices come last
-    for (PetscInt i = 0; i < n; ++i)
-      if (closure[2 * i] >= begin && closure[2 * i] < end) parent[root(closure[2 * i])] = joined;
-    PetscCall(DMPlexRestoreTransitiveClosure(dm, c, PETSC_TRUE, &n, &closure));
+  const auto cells_of = [&](PetscInt face, PetscInt &count, const PetscInt *&cells) {
+    PetscFunctionBeginUser;
+    PetscCall(DMPlexGetSupportSize(dm, face, &count));
+    PetscCall(DMPlexGetSupport(dm, face, &cells));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  };
+  PetscInt count;
+  const PetscInt *cells;
+  for (PetscInt face = face_begin; face < face_end; ++face) {
+    PetscCall(cells_of(face, count, cells));
+    if (count == 2) parent[root(cells[0] - begin)] = root(cells[1] - begin);
   }
 
+  // the least number of a cell spreads over each body, and through the shared faces over ranks
+  std::vector<PetscInt> least(static_cast<std::size_t>(n), PETSC_MAX_INT), at_face, sent;
+  for (PetscInt c = 0; c < n; ++c) least[root(c)] = std::min(least[root(c)], first + c);
   PetscCall(DMGetPointSF(dm, &sf));
   PetscCall(PetscSFGetGraph(sf, &roots, nullptr, nullptr, nullptr));
-  while (changed) { // the least number spreads over each body, then over ranks
+  while (changed && roots >= 0) {
     changed = 0;
-    for (PetscInt v = begin; v < end; ++v) {
-      PetscInt &least = of[root(v)];
-      if (of[v] < least) changed = 1;
-      least = std::min(least, of[v]);
+    at_face.assign(static_cast<std::size_t>(point_end), PETSC_MAX_INT);
+    for (PetscInt face = face_begin; face < face_end; ++face) {
+      PetscCall(cells_of(face, count, cells));
+      if (count > 0) at_face[face] = least[root(cells[0] - begin)];
     }
-    for (PetscInt v = begin; v < end; ++v) {
-      if (of[v] != of[root(v)]) changed = 1;
-      of[v] = of[root(v)];
-    }
-    if (roots >= 0) {
-      sent = of;
-      PetscCall(PetscSFReduceBegin(sf, MPIU_INT, sent.data(), of.data(), MPI_MIN));
-      PetscCall(PetscSFReduceEnd(sf, MPIU_INT, sent.data(), of.data(), MPI_MIN));
-      sent = of;
-      PetscCall(PetscSFBcastBegin(sf, MPIU_INT, sent.data(), of.data(), MPI_REPLACE));
-      PetscCall(PetscSFBcastEnd(sf, MPIU_INT, sent.data(), of.data(), MPI_REPLACE));
+    sent = at_face;
+    PetscCall(PetscSFReduceBegin(sf, MPIU_INT, sent.data(), at_face.data(), MPI_MIN));
+    PetscCall(PetscSFReduceEnd(sf, MPIU_INT, sent.data(), at_face.data(), MPI_MIN));
+    sent = at_face;
+    PetscCall(PetscSFBcastBegin(sf, MPIU_INT, sent.data(), at_face.data(), MPI_REPLACE));
+    PetscCall(PetscSFBcastEnd(sf, MPIU_INT, sent.data(), at_face.data(), MPI_REPLACE));
+    for (PetscInt face = face_begin; face < face_end; ++face) {
+      PetscCall(cells_of(face, count, cells));
+      if (count == 0) continue;
+      PetscInt &number = least[root(cells[0] - begin)];
+      if (at_face[face] < number) changed = 1;
+      number = std::min(number, at_face[face]);
     }
     PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &changed, 1, MPIU_INT, MPI_MAX, comm));
   }
-  body.assign(of.begin() + begin, of.begin() + end);
+  of.resize(static_cast<std::size_t>(n));
+  for (PetscInt c = 0; c < n; ++c) of[c] = least[root(c)];
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-/// The least number of a body above @p last, over all ranks; PETSC_MAX_INT after the last.
-PetscErrorCode next_body(MPI_Comm comm, const std::vector<PetscInt> &body, PetscInt last, PetscInt &next)
+/// All values of all ranks, each once, in order.
+PetscErrorCode union_of(MPI_Comm comm, std::vector<PetscInt> &values)
 {
+  PetscMPIInt size, n;
+
   PetscFunctionBeginUser;
-  next = PETSC_MAX_INT;
-  for (PetscInt number : body)
-    if (number > last) next = std::min(next, number);
-  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &next, 1, MPIU_INT, MPI_MIN, comm));
+  std::sort(values.begin(), values.end());
+  values.erase(std::unique(values.begin(), values.end()), values.end());
+  PetscCallMPI(MPI_Comm_size(comm, &size));
+  std::vector<PetscMPIInt> counts(size), offsets(size, 0);
+  n = static_cast<PetscMPIInt>(values.size());
+  PetscCallMPI(MPI_Allgather(&n, 1, MPI_INT, counts.data(), 1, MPI_INT, comm));
+  std::partial_sum(counts.begin(), counts.end() - 1, offsets.begin() + 1);
+  std::vector<PetscInt> all(static_cast<std::size_t>(offsets.back() + counts.back()));
+  PetscCallMPI(MPI_Allgatherv(values.data(), n, MPIU_INT, all.data(), counts.data(), offsets.data(), MPIU_INT, comm));
+  std::sort(all.begin(), all.end());
+  all.erase(std::unique(all.begin(), all.end()), all.end());
+  values = std::move(all);
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
 } // namespace
 
+PetscErrorCode Mesh::bodies(std::vector<Body> &list) const
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
+  PetscInt begin, end;
+  std::vector<PetscInt> number;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMPlexGetHeightStratum(dm_, 0, &begin, &end));
+  PetscCall(number_bodies(dm_, begin, end, number));
+  std::vector<PetscInt> numbers = number;
+  PetscCall(union_of(comm, numbers));
+  list.assign(numbers.size(), Body());
+  std::vector<PetscReal> moments(4 * numbers.size(), 0);
+  for (PetscInt c = 0; c < end - begin; ++c) {
+    const auto b =
+        static_cast<std::size_t>(std::lower_bound(numbers.begin(), numbers.end(), number[c]) - numbers.begin());
+    PetscReal volume, centre[3];
+    list[b].cells.push_back(c);
+    PetscCall(DMPlexComputeCellGeometryFVM(dm_, begin + c, &volume, centre, nullptr));
+    for (int d = 0; d < 3; ++d) moments[4 * b + d] += volume * centre[d];
+    moments[4 * b + 3] += volume;
+  }
+  PetscCallMPI(
+      MPI_Allreduce(MPI_IN_PLACE, moments.data(), static_cast<PetscMPIInt>(moments.size()), MPIU_REAL, MPI_SUM, comm));
+  for (std::size_t b = 0; b < list.size(); ++b) {
+    list[b].volume = moments[4 * b + 3];
+    for (int d = 0; d < 3; ++d) list[b].centroid[d] = moments[4 * b + d] / list[b].volume;
+  }
+  // the numbers of the bodies depend on how the mesh is distributed, their places do not
+  const PetscReal rounding = 1e-6 * length_;
+  std::sort(list.begin(), list.end(), [rounding](const Body &a, const Body &b) {
+    for (int d = 0; d < 3; ++d)
+      if (std::abs(a.centroid[d] - b.centroid[d]) > rounding) return a.centroid[d] < b.centroid[d];
+    return a.volume < b.volume * (1 - 1e-9);
+  });
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Mesh::body_of_cells(const std::vector<Body> &list, std::vector<PetscInt> &body_of) const
+{
+  PetscInt begin, end;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMPlexGetHeightStratum(dm_, 0, &begin, &end));
+  body_of.assign(static_cast<std::size_t>(end - begin), -1);
+  for (std::size_t b = 0; b < list.size(); ++b)
+    for (const PetscInt c : list[b].cells) body_of[c] = static_cast<PetscInt>(b);
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode Mesh::require_in_each_body(const std::vector<std::string> &names, const std::string &complaint) const
 {
   const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
-  PetscInt begin, end, last = -1;
-  std::vector<PetscInt> body;
-  std::set<PetscInt> reached; // bodies
+  PetscInt begin;
+  std::vector<Body> list;
+  std::vector<PetscInt> body_of;
 
   PetscFunctionBeginUser;
-  PetscCall(DMPlexGetDepthStratum(dm_, 0, &begin, &end));
-  PetscCall(find_bodies(dm_, begin, end, body));
+  PetscCall(DMPlexGetHeightStratum(dm_, 0, &begin, nullptr));
+  PetscCall(bodies(list));
+  PetscCall(body_of_cells(list, body_of));
+  std::vector<int> reached(list.size(), 0);
   for (const std::string &name : names) {
     std::vector<PetscInt> points;
     PetscCall(facets(name, points));
     for (const PetscInt facet : points) {
-      const PetscInt *cone;
-      PetscCall(DMPlexGetCone(dm_, facet, &cone));   // edges
-      PetscCall(DMPlexGetCone(dm_, cone[0], &cone)); // vertices
-      reached.insert(body[cone[0] - begin]);
+      const PetscInt *cell;
+      PetscCall(DMPlexGetSupport(dm_, facet, &cell));
+      reached[body_of[cell[0] - begin]] = 1;
     }
   }
-  for (;;) {
-    PetscInt next;
-    PetscReal sums[5] = {0, 0, 0, 0, 0}; // coordinates and number of the body's vertices, ranks where it is reached
-    PetscCall(next_body(comm, body, last, next));
-    if (next == PETSC_MAX_INT) break;
-    sums[4] = static_cast<PetscReal>(reached.count(next));
-    for (PetscInt v = begin; v < end; ++v) {
-      PetscReal x[3];
-      if (body[v - begin] != next) continue;
-      PetscCall(node_coordinates(v, x));
-      for (int d = 0; d < 3; ++d) sums[d] += x[d];
-      ++sums[3];
+  PetscCallMPI(
+      MPI_Allreduce(MPI_IN_PLACE, reached.data(), static_cast<PetscMPIInt>(reached.size()), MPI_INT, MPI_MAX, comm));
+  for (std::size_t b = 0; b < list.size(); ++b)
+    PulmoUserCheck(reached[b], comm, "%s %s", body_text(list[b]).c_str(), complaint.c_str());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+std::string Mesh::body_text(const Body &body) const
+{
+  char text[120];
+  std::snprintf(text, sizeof(text), "the body around (%.6g, %.6g, %.6g) mm of mesh ", (double)body.centroid[0],
+                (double)body.centroid[1], (double)body.centroid[2]);
+  return text + file_;
+}
+
+PetscErrorCode Mesh::hinge(const std::vector<Body> &list, Hinge &found) const
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
+  PetscInt begin, end, cell_begin, roots, point_end;
+  PetscMPIInt size;
+  PetscSF sf;
+  std::vector<PetscInt> body_of;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMPlexGetDepthStratum(dm_, 0, &begin, &end));
+  PetscCall(DMPlexGetHeightStratum(dm_, 0, &cell_begin, nullptr));
+  PetscCall(DMPlexGetChart(dm_, nullptr, &point_end));
+  PetscCall(body_of_cells(list, body_of));
+  std::vector<PetscInt> least(static_cast<std::size_t>(point_end), PETSC_MAX_INT), largest(least.size(), -1);
+  for (std::size_t c = 0; c < body_of.size(); ++c) {
+    PetscInt *closure = nullptr, n;
+    const PetscInt cell = cell_begin + static_cast<PetscInt>(c);
+    PetscCall(DMPlexGetTransitiveClosure(dm_, cell, PETSC_TRUE, &n, &closure));
+    for (PetscInt i = 0; i < n; ++i) {
+      const PetscInt p = closure[2 * i];
+      least[p] = std::min(least[p], body_of[c]);
+      largest[p] = std::max(largest[p], body_of[c]);
     }
-    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, sums, 5, MPIU_REAL, MPI_SUM, comm));
-    PulmoUserCheck(sums[4] > 0, comm, "the body around (%.6g, %.6g, %.6g) mm of mesh %s %s",
-                   (double)(sums[0] / sums[3]), (double)(sums[1] / sums[3]), (double)(sums[2] / sums[3]), file_.c_str(),
-                   complaint.c_str());
-    last = next;
+    PetscCall(DMPlexRestoreTransitiveClosure(dm_, cell, PETSC_TRUE, &n, &closure));
   }
+  PetscCall(DMGetPointSF(dm_, &sf));
+  PetscCall(PetscSFGetGraph(sf, &roots, nullptr, nullptr, nullptr));
+  if (roots >= 0) { // what is at a vertex of other ranks, too, its owner knows
+    std::vector<PetscInt> sent = least;
+    PetscCall(PetscSFReduceBegin(sf, MPIU_INT, sent.data(), least.data(), MPI_MIN));
+    PetscCall(PetscSFReduceEnd(sf, MPIU_INT, sent.data(), least.data(), MPI_MIN));
+    sent = largest;
+    PetscCall(PetscSFReduceBegin(sf, MPIU_INT, sent.data(), largest.data(), MPI_MAX));
+    PetscCall(PetscSFReduceEnd(sf, MPIU_INT, sent.data(), largest.data(), MPI_MAX));
+  }
+  // the one of least coordinates, whatever the ranks are
+  using Candidate = std::array<double, 5>;
+  Candidate best{HUGE_VAL, 0, 0, -1, -1};
+  for (PetscInt v = begin; v < end; ++v) {
+    PetscReal x[3];
+    if (least[v] >= largest[v]) continue;
+    PetscCall(node_coordinates(v, x));
+    best = std::min(best, Candidate{x[0], x[1], x[2], (double)least[v], (double)largest[v]});
+  }
+  PetscCallMPI(MPI_Comm_size(comm, &size));
+  std::vector<Candidate> all(size);
+  PetscCallMPI(MPI_Allgather(best.data(), 5, MPI_DOUBLE, all.data(), 5, MPI_DOUBLE, comm));
+  best = *std::min_element(all.begin(), all.end());
+  for (int d = 0; d < 3; ++d) found.x[d] = best[d];
+  for (int i = 0; i < 2; ++i) found.body[i] = static_cast<PetscInt>(best[3 + i]);
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
 PetscErrorCode Mesh::regions(std::vector<Region> &list) const
 {
   const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
-  PetscInt vertex_begin, vertex_end, begin, end, last = -1;
-  std::vector<PetscInt> body_of, cell_body;
-  struct Body {
-    Region region;
-    PetscReal centroid[3];
-  };
-  std::vector<Body> bodies;
+  PetscInt begin, end;
+  std::vector<Body> all;
+  std::vector<Region> parts; // one for each body
 
   PetscFunctionBeginUser;
-  PetscCall(DMPlexGetDepthStratum(dm_, 0, &vertex_begin, &vertex_end));
   PetscCall(DMPlexGetHeightStratum(dm_, 0, &begin, &end));
-  PetscCall(find_bodies(dm_, vertex_begin, vertex_end, body_of));
-  for (PetscInt c = begin; c < end; ++c) {
-    const PetscInt *cone = &c; // a face, an edge, a vertex of the cell
-    for (int depth = 0; depth < 3; ++depth) PetscCall(DMPlexGetCone(dm_, cone[0], &cone));
-    cell_body.push_back(body_of[cone[0] - vertex_begin]);
-  }
-  for (;;) {
-    PetscInt next;
-    PetscReal moments[4] = {0, 0, 0, 0};
-    Body body;
-    PetscCall(next_body(comm, body_of, last, next));
-    if (next == PETSC_MAX_INT) break;
-    for (PetscInt c = 0; c < end - begin; ++c) {
-      PetscReal volume, centre[3];
-      if (cell_body[c] != next) continue;
-      body.region.cells.push_back(c);
-      PetscCall(DMPlexComputeCellGeometryFVM(dm_, begin + c, &volume, centre, nullptr));
-      moments[3] += volume;
-      for (int d = 0; d < 3; ++d) moments[d] += volume * centre[d];
-    }
-    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, moments, 4, MPIU_REAL, MPI_SUM, comm));
-    for (int d = 0; d < 3; ++d) body.centroid[d] = moments[d] / moments[3];
-    body.region.body = true;
-    bodies.push_back(body);
-    last = next;
-  }
-  // the numbers of the bodies depend on how the mesh is distributed, their places do not
-  const PetscReal rounding = 1e-6 * length_;
-  std::sort(bodies.begin(), bodies.end(), [rounding](const Body &a, const Body &b) {
-    for (int d = 0; d < 3; ++d)
-      if (std::abs(a.centroid[d] - b.centroid[d]) > rounding) return a.centroid[d] < b.centroid[d];
-    return false;
-  });
+  PetscCall(bodies(all));
+  for (Body &body : all) parts.push_back({"", true, std::move(body.cells)});
 
   list.clear();
   for (const Part &part : parts_) {
@@ -183,49 +257,46 @@ PetscErrorCode Mesh::regions(std::vector<Region> &list) const
     region.name = part.name;
     PetscCall(elements(part, region.cells));
     for (PetscInt &c : region.cells) c -= begin;
-    for (Body &body : bodies) {
-      int same = body.region.cells == region.cells;
+    for (Region &body : parts) {
+      int same = body.cells == region.cells;
       PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &same, 1, MPI_INT, MPI_LAND, comm));
-      if (!same || !body.region.name.empty()) continue;
+      if (!same || !body.name.empty()) continue;
       region.body = true;
-      body.region.name = part.name;
+      body.name = part.name;
     }
     list.push_back(region);
   }
   std::sort(list.begin(), list.end(), [](const Region &a, const Region &b) { return a.name < b.name; });
   int unnamed = 0;
-  for (Body &body : bodies) {
-    if (!body.region.name.empty()) continue;
-    body.region.name = "body_" + std::to_string(++unnamed);
-    list.push_back(body.region);
+  for (Region &body : parts) {
+    if (!body.name.empty()) continue;
+    body.name = "body_" + std::to_string(++unnamed);
+    list.push_back(body);
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Mesh::rigid_pins(std::vector<Pin> &pins) const
+PetscErrorCode Mesh::vertices(const Body &body, std::vector<PetscInt> &points) const
 {
-  const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
-  PetscInt begin, end, last = -1;
-  std::vector<PetscInt> body;
+  PetscInt begin, end, cell_begin;
 
   PetscFunctionBeginUser;
+  points.clear();
   PetscCall(DMPlexGetDepthStratum(dm_, 0, &begin, &end));
-  PetscCall(find_bodies(dm_, begin, end, body));
-  pins.clear();
-  for (;;) { // bodies in the order of their numbers
-    PetscInt next;
-    std::vector<PetscInt> vertices;
-    PetscCall(next_body(comm, body, last, next));
-    if (next == PETSC_MAX_INT) break;
-    for (PetscInt v = begin; v < end; ++v)
-      if (body[v - begin] == next) vertices.push_back(v);
-    PetscCall(pin_body(vertices, pins));
-    last = next;
+  PetscCall(DMPlexGetHeightStratum(dm_, 0, &cell_begin, nullptr));
+  for (const PetscInt c : body.cells) {
+    PetscInt *closure = nullptr, n;
+    PetscCall(DMPlexGetTransitiveClosure(dm_, cell_begin + c, PETSC_TRUE, &n, &closure));
+    for (PetscInt i = 0; i < n; ++i)
+      if (closure[2 * i] >= begin && closure[2 * i] < end) points.push_back(closure[2 * i]);
+    PetscCall(DMPlexRestoreTransitiveClosure(dm_, cell_begin + c, PETSC_TRUE, &n, &closure));
   }
+  std::sort(points.begin(), points.end());
+  points.erase(std::unique(points.begin(), points.end()), points.end());
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Mesh::pin_body(const std::vector<PetscInt> &vertices, std::vector<Pin> &pins) const
+PetscErrorCode Mesh::rigid_pins(const Body &body, std::vector<Pin> &pins) const
 {
   using Coordinates = std::array<PetscReal, 3>;
   constexpr PetscReal off_axis = 3; // weight of what leads away from an axis
@@ -233,8 +304,11 @@ PetscErrorCode Mesh::pin_body(const std::vector<PetscInt> &vertices, std::vector
   PetscMPIInt size;
   std::array<Coordinates, 3> chosen{};
   int along = 2, across = 0; // the axis that AB is close to; the second axis of the plane that ABC is close to
+  std::vector<PetscInt> vertices;
 
   PetscFunctionBeginUser;
+  pins.clear();
+  PetscCall(this->vertices(body, vertices));
   PetscCallMPI(MPI_Comm_size(comm, &size));
   // A: the lowest vertex. B: far from A and close to an axis through A. C: far from AB and close to a plane of two
   // axes through it. Then the held components hardly turn a lung that swells. Ranks that share a vertex have the same

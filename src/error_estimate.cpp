@@ -324,7 +324,7 @@ PetscErrorCode ErrorEstimate::run_level(const Options &options, const Output &ou
   Run run(registry_);
   PetscCall(run.declare());
   PetscCall(run.setup());
-  PetscCall(check_held(comm, run.scene(), run.model().composition()));
+  PetscCall(check_held(run.scene(), run.model()));
   Simulation &simulation = run.simulation();
   ProgressPrinter progress(comm, run.scene().facts());
   Sampling sampling;

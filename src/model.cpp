@@ -454,29 +454,37 @@ PetscErrorCode Model::set_step(PetscReal dt, PetscReal airway_pressure, PetscRea
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+std::vector<PetscScalar> Composition::constants(const Step &step) const
+{
+  std::vector<ParameterBlock> blocks = parameters_;
+
+  // the step is asked for by every kernel: first in the directory
+  blocks.insert(blocks.begin(),
+                {Step::owner, reinterpret_cast<const PetscScalar *>(&step), sizeof(Step) / sizeof(PetscScalar)});
+  const auto n = static_cast<PetscInt>(blocks.size());
+  std::vector<PetscScalar> all(1, static_cast<PetscScalar>(n));
+  PetscInt offset = 1 + 2 * n;
+  for (const ParameterBlock &block : blocks) {
+    all.push_back(constants::tag(block.owner));
+    all.push_back(static_cast<PetscScalar>(offset));
+    offset += block.count;
+  }
+  for (const ParameterBlock &block : blocks) all.insert(all.end(), block.data, block.data + block.count);
+  return all;
+}
+
 PetscErrorCode Model::pack_constants()
 {
   PetscDS ds;
-  std::vector<ParameterBlock> blocks = composition().parameter_blocks();
 
   PetscFunctionBeginUser;
-  blocks.push_back({Step::owner, reinterpret_cast<const PetscScalar *>(&step_), sizeof(Step) / sizeof(PetscScalar)});
-  // the step is asked for by every kernel: first in the directory
-  std::rotate(blocks.begin(), blocks.end() - 1, blocks.end());
-  const auto n = static_cast<PetscInt>(blocks.size());
-  constants_.assign(1, static_cast<PetscScalar>(n));
-  PetscInt offset = 1 + 2 * n;
-  for (const ParameterBlock &block : blocks) {
-    constants_.push_back(constants::tag(block.owner));
-    constants_.push_back(static_cast<PetscScalar>(offset));
-    offset += block.count;
-  }
-  for (const ParameterBlock &block : blocks) constants_.insert(constants_.end(), block.data, block.data + block.count);
+  constants_ = composition().constants(step_);
+  const auto n = static_cast<PetscInt>(constants_.size());
   PetscCall(DMGetDS(dm_, &ds));
-  PetscCall(PetscDSSetConstants(ds, offset, constants_.data()));
+  PetscCall(PetscDSSetConstants(ds, n, constants_.data()));
   if (stock_dm_) {
     PetscCall(DMGetDS(stock_dm_, &ds));
-    PetscCall(PetscDSSetConstants(ds, offset, constants_.data()));
+    PetscCall(PetscDSSetConstants(ds, n, constants_.data()));
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }

@@ -81,6 +81,7 @@ PetscErrorCode Simulation::persist(Archive &archive)
   PetscCall(archive.value("delivered_mm3", delivered_));
   PetscCall(archive.value("mass_balance_error_mm3", worst_balance_));
   PetscCall(archive.value("support_reaction_kPa_mm2", worst_reaction_));
+  if (model_.composition().pinned()) PetscCall(pins_.persist(archive));
   PetscCall(archive.value("min_J", min_J_));
   if (archive.reading()) PetscCall(resume(archive, index, wanted_dt, phase_end));
   PetscCall(airway_.persist(archive));

@@ -1,6 +1,7 @@
 #include "pulmo/pulmo.hpp"
 
 #include "pulmo/checkpoint.hpp"
+#include "pulmo/held.hpp"
 
 #include <algorithm>
 #include <csignal>
@@ -170,23 +171,14 @@ PetscErrorCode warn_of_equal_order(MPI_Comm comm, const Scene &scene, const Mode
 
 } // namespace
 
-PetscErrorCode check_held(MPI_Comm comm, const Scene &scene, const Composition &composition)
+PetscErrorCode check_held(const Scene &scene, const Model &model)
 {
-  const std::vector<std::string> surfaces = composition.holding_surfaces();
-
-  PetscFunctionBeginUser;
-  PulmoUserCheck(
-      !surfaces.empty(), comm,
-      "nothing holds the lung in place: give -chest_wall (springs), or -support -support_rigid to let it move "
-      "freely but for the six rigid-body motions");
-  const bool everywhere = std::find(surfaces.begin(), surfaces.end(), "") != surfaces.end();
-  if (!everywhere)
-    PetscCall(scene.mesh().require_in_each_body(
-        surfaces,
-        "is held in place by nothing: name a surface of it with -chest_wall_surfaces or -support_surfaces, or "
-        "join the bodies in gmsh"));
+  const Composition &composition = model.composition();
   const std::vector<std::string> walls = composition.surfaces_of("lumen_pressure"),
                                  bearing = composition.bearing_surfaces();
+
+  PetscFunctionBeginUser;
+  PetscCall(check_held(PetscObjectComm((PetscObject)model.dm()), composition, model.modulus()));
   if (!walls.empty() && std::find(bearing.begin(), bearing.end(), "") == bearing.end())
     PetscCall(check_wall_load(scene.mesh(), walls, bearing));
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -232,6 +224,8 @@ PetscErrorCode Run::setup()
   PetscCall(scene_.prepare(options_));
   Composition composition(scene_.mesh(), scene_.facts().elements);
   PetscCall(scene_.compose(composition));
+  PetscCall(check_prescribed_once(composition));
+  PetscCall(pin_free_motions(composition));
   PetscCall(model_.build(std::move(composition), reference_modulus(scene_.tissue().law())));
   PetscCall(settle_under_loads(scene_, model_, settle_note_));
   PetscCall(simulation_.setup());
@@ -273,7 +267,7 @@ PetscErrorCode run(const Registry &registry, bool &finished)
     finished = true;
     PetscFunctionReturn(PETSC_SUCCESS);
   }
-  PetscCall(check_held(comm, scene, run.model().composition()));
+  PetscCall(check_held(scene, run.model()));
   if (!run.settle_note().empty()) PetscCall(PetscPrintf(comm, "pulmo: note: %s\n", run.settle_note().c_str()));
   PetscCall(note_no_breath(comm, scene));
   PetscCall(error_estimate.check(options, scene));
@@ -322,6 +316,7 @@ PetscErrorCode run(const Registry &registry, bool &finished)
   }
   PetscCall(options.warn_unused());
   PetscCall(warn_of_no_air(comm, scene, simulation));
+  PetscCall(simulation.pins().warn(run.model()));
   for (const SignalRow &row : simulation.rows()) // steps that were cut
     if (row.dt > 0) PetscCall(warn_of_equal_order(comm, scene, run.model(), row.dt, warned_of_elements));
   if (view_effects) PetscCall(print_ledger(comm, scene, run.model(), simulation.seconds()));

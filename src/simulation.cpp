@@ -609,6 +609,7 @@ PetscErrorCode Simulation::after_step()
     PetscCall(model_.reactions(local_residual_, forces));
     for (const auto &force : forces)
       for (const PetscReal f : force) worst_reaction_ = std::max(worst_reaction_, std::abs(f));
+    if (model_.composition().pinned()) PetscCall(pins_.follow(model_, forces, local_, t, pressure));
   }
   if (free) {
     row.flow = airway_.flow() / units::mm3_per_ml;

@@ -170,6 +170,7 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
     if (scene.facts().airflow) json["mass_balance_error_ml"] = simulation.mass_balance_error() / units::mm3_per_ml;
     if (model.composition().supported())
       json["support_reaction_n"] = simulation.support_reaction() * units::newton_per_kPa_mm2;
+    if (model.composition().pinned()) json["pin_force_n"] = simulation.pins().largest() * units::newton_per_kPa_mm2;
     json["min_jacobian"] = simulation.min_J();
     if (scene.facts().airflow) json["min_porosity"] = 1 - (1 - scene.airflow().porosity()) / simulation.min_J();
     json["end_time_s"] = simulation.time();

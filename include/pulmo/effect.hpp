@@ -10,6 +10,7 @@
 #include "pulmo/programme.hpp"
 #include "pulmo/tissue_law.hpp"
 
+#include <algorithm>
 #include <cmath>
 #include <functional>
 #include <memory>
@@ -50,6 +51,7 @@ struct Constraint {
   std::string surface;            ///< empty: at @p vertices
   std::vector<PetscInt> vertices; ///< local mesh points (on every rank that has them)
   bool at_airway = false;         ///< steered by the ventilator: its pressure while it holds one, else free
+  PetscInt pinned_body = -1;      ///< the body of Mesh::bodies() that this pins against a rigid motion; -1: no pin
   /// Value of all components at time t (s) and material point x (mm); unused if at_airway.
   std::function<void(PetscReal t, const PetscReal x[3], PetscScalar value[3])> value;
 };
@@ -166,19 +168,18 @@ public:
       if (c.field == displacement) return true;
     return false;
   }
-  /// The surfaces where something holds the lung: a prescribed displacement, or a term that resists displacement
-  /// itself; an empty name stands for all of the lung. (It may still be too little to stop every rigid motion.)
-  std::vector<std::string> holding_surfaces() const
+  /// Asks for pins against the rigid motions that nothing else holds, once all effects have spoken.
+  void pin_free_motions() { pins_for_ = effect_; }
+  /// The effect that asked for them, or nothing.
+  const std::string &pins_for() const { return pins_for_; }
+  bool pinned() const
   {
-    std::vector<std::string> list;
-    for (const Constraint &c : constraints_)
-      if (c.field == displacement) list.push_back(c.surface);
-    for (const Term &t : terms_)
-      if (t.test == displacement && t.trial == displacement && (t.g0 || t.bd_g0)) list.push_back(t.surface);
-    return list;
+    return std::any_of(constraints_.begin(), constraints_.end(),
+                       [](const Constraint &c) { return c.pinned_body >= 0; });
   }
 
-  /// The same without pins at single vertices, which bear no load.
+  /// The surfaces where something bears a load: a prescribed displacement, or a term that resists displacement itself;
+  /// an empty name stands for all of the lung. Pins at single vertices bear none.
   std::vector<std::string> bearing_surfaces() const
   {
     std::vector<std::string> list;
@@ -202,6 +203,8 @@ public:
   const std::vector<Constraint> &constraints() const { return constraints_; }
   const std::vector<EnergyTerm> &energies() const { return energies_; }
   const std::vector<ParameterBlock> &parameter_blocks() const { return parameters_; }
+  /// Constants of PetscDS for a step: those of the step and of all effects, under a directory.
+  std::vector<PetscScalar> constants(const Step &step) const;
 
 private:
   /// Whether a term resists displacement itself.
@@ -219,7 +222,7 @@ private:
 
   const Mesh &mesh_;
   Elements elements_;
-  std::string effect_;
+  std::string effect_, pins_for_;
   bool common_gas_pressure_ = false;
   std::vector<FieldSpec> fields_;
   std::vector<Term> terms_;

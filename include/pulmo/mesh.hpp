@@ -35,6 +35,16 @@ public:
     bool body = false;           ///< one connected body and no more
     std::vector<PetscInt> cells; ///< those of this rank, counted from 0
   };
+  /// A connected body: cells that are joined by facets. Bodies that share no more than edges and vertices are apart.
+  struct Body {
+    std::vector<PetscInt> cells;                   ///< those of this rank, counted from 0
+    PetscReal centroid[3] = {0, 0, 0}, volume = 0; ///< mm, mm^3
+  };
+  /// A vertex that two bodies share.
+  struct Hinge {
+    PetscInt body[2] = {-1, -1}; ///< -1: there is none
+    PetscReal x[3] = {0, 0, 0};  ///< mm
+  };
   /// A vertex held against rigid motion (Mesh::rigid_pins).
   struct Pin {
     PetscInt vertex = -1; ///< local mesh point, -1 on ranks without it
@@ -49,6 +59,7 @@ public:
   PetscErrorCode read(const Options &options, bool ventilated);
 
   DM dm() const { return dm_; }
+  const std::string &file() const { return file_; }
   PetscReal volume() const { return volume_; }   ///< mm^3, reference configuration
   PetscReal length() const { return length_; }   ///< mean cell size (volume per cell)^(1/3), mm
   PetscReal edge() const { return 2 * length_; } ///< about the mean edge of a cell, mm
@@ -67,8 +78,18 @@ public:
   /// User error, naming the place and ending with @p complaint, unless every connected body has facets of one of these
   /// surfaces.
   PetscErrorCode require_in_each_body(const std::vector<std::string> &names, const std::string &complaint) const;
-  /// Three vertices of each connected body and 3, 2, 1 components that remove exactly its six rigid-body modes.
-  PetscErrorCode rigid_pins(std::vector<Pin> &pins) const;
+  /// The connected bodies, in the order of their places: along x, then y, then z.
+  PetscErrorCode bodies(std::vector<Body> &list) const;
+  /// body_of[cell of this rank, counted from 0]: which of the list.
+  PetscErrorCode body_of_cells(const std::vector<Body> &list, std::vector<PetscInt> &body_of) const;
+  /// The vertices of a body that this rank's cells of it have (mesh points, in order).
+  PetscErrorCode vertices(const Body &body, std::vector<PetscInt> &points) const;
+  /// A vertex where bodies of the list hang together, if there is any.
+  PetscErrorCode hinge(const std::vector<Body> &list, Hinge &found) const;
+  /// "the body around (x, y, z) mm of mesh FILE"
+  std::string body_text(const Body &body) const;
+  /// Three vertices of a body and 3, 2, 1 components that remove exactly its six rigid-body modes.
+  PetscErrorCode rigid_pins(const Body &body, std::vector<Pin> &pins) const;
   /// Every connected body and every named part of the volume. A body without a name of its own is called body_1, ...,
   /// counted along x.
   PetscErrorCode regions(std::vector<Region> &list) const;
@@ -85,7 +106,6 @@ private:
   PetscErrorCode check_parts(MPI_Comm comm, PetscInt cells_in_file, PetscReal volume_of_file) const;
   PetscErrorCode check_cells(const Options &options);
   PetscErrorCode find_surfaces(const Options &options);
-  PetscErrorCode pin_body(const std::vector<PetscInt> &vertices, std::vector<Pin> &pins) const;
   std::string surface_names() const;
 
   DMHandle dm_;

@@ -41,8 +41,8 @@ private:
 /// pressure. @p note: what the user is told of it.
 PetscErrorCode settle_under_loads(Scene &scene, Model &model, std::string &note);
 
-/// Refuses a lung, or one of several bodies, that nothing holds in place.
-PetscErrorCode check_held(MPI_Comm comm, const Scene &scene, const Composition &composition);
+/// Refuses a lung with a rigid motion that nothing holds, or with a wall load that nothing bears.
+PetscErrorCode check_held(const Scene &scene, const Model &model);
 
 /// Runs the scene of the options database and writes its output. @p finished tells whether the run reached its
 /// end; errors that a sentence tells come back with the code of their kind, already printed.

@@ -5,6 +5,7 @@
 #include "pulmo/airway.hpp"
 #include "pulmo/archive.hpp"
 #include "pulmo/clinical.hpp"
+#include "pulmo/held.hpp"
 #include "pulmo/lagging.hpp"
 #include "pulmo/model.hpp"
 #include "pulmo/predictor.hpp"
@@ -79,6 +80,7 @@ public:
   PetscReal mass_balance_error() const { return worst_balance_; } ///< largest of the run, mm^3
   PetscReal min_J() const { return min_J_; }
   PetscReal support_reaction() const { return worst_reaction_; } ///< largest force component of the run, kPa mm^2
+  const PinForces &pins() const { return pins_; }
   PetscInt rejected_steps() const { return rejected_; }
   const StageSeconds &seconds() const { return seconds_; }
   const TimeScheme &scheme() const { return scheme_; }
@@ -152,6 +154,7 @@ private:
   StepControl step_control_;
   StepControl::Value candidate_; ///< at the end of the step that is to be accepted
   Predictor predictor_;
+  PinForces pins_;
   Lagging lagging_;
   std::vector<Observer *> observers_;
   StopSignal *stop_signal_ = nullptr;

@@ -187,6 +187,7 @@ PetscErrorCode read_mesh(const std::string &file)
   Options options(PETSC_COMM_WORLD);
   std::vector<Mesh::Region> regions;
   std::vector<Mesh::Pin> pins;
+  std::vector<Mesh::Body> bodies;
 
   PetscFunctionBeginUser;
   PetscCall(set_options("-dm_plex_filename " + file));
@@ -195,7 +196,8 @@ PetscErrorCode read_mesh(const std::string &file)
   PetscCall(mesh.require_surfaces({"airway", "pleura"}, "-some_surfaces"));
   PetscCall(mesh.require_in_each_body({"airway"}, "has no airway"));
   PetscCall(mesh.regions(regions));
-  PetscCall(mesh.rigid_pins(pins));
+  PetscCall(mesh.bodies(bodies));
+  for (const Mesh::Body &body : bodies) PetscCall(mesh.rigid_pins(body, pins));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -38,7 +38,8 @@ struct SceneSpec {
     if (traction)
       s += " -traction -traction_surfaces y0,x0 -traction_value 0.1,-0.2,0.05 -traction_value_y0 0.03,0.3,0.02";
     if (support == "surfaces")
-      s += " -support -support_surfaces y1,z0 -support_components_z0 xz -support_displacement_y1 0.01,0.02,-0.01";
+      s += " -support -support_surfaces y1,z0 -support_components_z0 xz -support_displacement_y1 0.01,0.02,-0.01"
+           " -support_displacement_z0 0.01,0,-0.01";
     if (support == "rigid") s += " -support -support_rigid";
     return s + " " + more;
   }

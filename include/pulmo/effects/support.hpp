@@ -1,6 +1,6 @@
 /// @file
-/// Effect `support`: prescribed displacement components on surfaces, and the 3-2-1 point pins that remove the
-/// six rigid-body modes of a lung without springs (K_s = 0).
+/// Effect `support`: prescribed displacement components on surfaces, and pins of single vertices against the rigid
+/// motions that nothing else holds (a lung without springs, K_s = 0: all six of each body).
 #pragma once
 
 #include "pulmo/effect.hpp"
@@ -13,7 +13,7 @@ namespace pulmo {
 class Support final : public Effect {
 public:
   const char *name() const override { return "support"; }
-  const char *about() const override { return "prescribed displacement on surfaces, or 3-2-1 point pins"; }
+  const char *about() const override { return "prescribed displacement on surfaces, pins against rigid motions"; }
   bool active() const override { return on_; }
 
   PetscErrorCode declare(Options &options) override
@@ -22,7 +22,7 @@ public:
     options.group(name(), about());
     PetscCall(options.flag("", "prescribed displacement", on_));
     options.group(name(), about(), on_, "-support");
-    PetscCall(options.flag("rigid", "pin three vertices (3, 2, 1 components) against rigid motion only", rigid_));
+    PetscCall(options.flag("rigid", "pin vertices against the rigid motions that nothing else holds", rigid_));
     PetscCall(options.names("surfaces", "surfaces with prescribed displacement", surfaces_));
     for (const std::string &surface : surfaces_) {
       Held held;
@@ -43,6 +43,15 @@ public:
     PulmoUserCheck(rigid_ || !surfaces_.empty(), options.comm(),
                    "-support holds nothing: give -support_surfaces NAME,... or -support_rigid");
     PetscCall(mesh.require_surfaces(surfaces_, "-support_surfaces"));
+    for (std::size_t i = 0; i < surfaces_.size(); ++i)
+      for (int d = 0; d < 3; ++d)
+        if (held_[i].value[d] != 0 && !held_[i].holds(d))
+          PetscCall(PetscPrintf(options.comm(),
+                                "pulmo: warning: -support_displacement_%s gives %.6g mm along %c, which "
+                                "-support_components_%s %s does not hold: it is not used; add the component, or leave "
+                                "its value 0\n",
+                                surfaces_[i].c_str(), (double)held_[i].value[d], "xyz"[d], surfaces_[i].c_str(),
+                                held_[i].components.c_str()));
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
@@ -53,25 +62,14 @@ public:
       Constraint hold;
       hold.name = "u on " + surfaces_[i];
       hold.surface = surfaces_[i];
-      for (int d = 0; d < 3; ++d) hold.component[d] = held_[i].components.find("xyz"[d]) != std::string::npos;
+      for (int d = 0; d < 3; ++d) hold.component[d] = held_[i].holds(d);
       const std::array<PetscReal, 3> v = held_[i].value;
       hold.value = [v](PetscReal, const PetscReal[3], PetscScalar u[3]) {
         for (int d = 0; d < 3; ++d) u[d] = v[d];
       };
       c.constrain(hold);
     }
-    if (rigid_) {
-      std::vector<Mesh::Pin> pins;
-      PetscCall(c.mesh().rigid_pins(pins));
-      for (const Mesh::Pin &pin : pins) {
-        Constraint hold;
-        hold.name = "pin";
-        for (int d = 0; d < 3; ++d) hold.component[d] = pin.component[d];
-        if (pin.vertex >= 0) hold.vertices.push_back(pin.vertex);
-        hold.value = [](PetscReal, const PetscReal[3], PetscScalar u[3]) { u[0] = u[1] = u[2] = 0; };
-        c.constrain(hold);
-      }
-    }
+    if (rigid_) c.pin_free_motions();
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
@@ -79,6 +77,8 @@ private:
   struct Held {
     std::string components = "xyz";
     std::array<PetscReal, 3> value{0, 0, 0};
+
+    bool holds(int d) const { return components.find("xyz"[d]) != std::string::npos; }
   };
 
   bool on_ = false, rigid_ = false;
