@@ -78,18 +78,18 @@ PetscErrorCode Airway::guess(Vec X) const
 PetscErrorCode Airway::apply(Vec X)
 {
   PetscFunctionBeginUser;
-  if (mode_ == Mode::common) PetscCall(model_.carrier_value(X, pressure_));
+  if (mode_ == Mode::common && !frozen_) PetscCall(model_.carrier_value(X, pressure_));
   model_.hold_airway(mode_ != Mode::free);
   PetscCall(model_.set_step(1 / scheme_.slope(), pressure_, mode_ == Mode::free ? flow() : 0));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Airway::close(PetscReal volume, Vec F)
+PetscErrorCode Airway::close(PetscReal volume, Vec X, Vec F)
 {
   PetscFunctionBeginUser;
   volume_ = volume;
-  PetscCall(model_.close_rows(F));
-  if (mode_ == Mode::common) {
+  PetscCall(model_.close_rows(X, F));
+  if (mode_ == Mode::common && !frozen_) {
     const PetscReal h = model_.composition().mesh().length(), Q = scheme_.flow(volume);
     const PetscReal c = control() == Control::flow ? (volume - volume_target_) / (h * h * h)
                                                    : (ventilator_pressure(Q) - target_) / model_.modulus();
@@ -105,6 +105,16 @@ PetscReal Airway::change(PetscReal c, PetscReal c_P, PetscReal volume_fixed, Pet
                             ? 1 / (h * h * h)
                             : facts_.tube->slope(scheme_.flow(volume_)) * scheme_.slope() / model_.modulus();
   return -(c + c_V * volume_fixed) / (c_P + c_V * volume_per_P);
+}
+
+Airway::Unmet Airway::unmet(PetscReal volume) const
+{
+  Unmet unmet;
+  if (control() == Control::flow)
+    unmet.volume = std::abs(volume - volume_target_);
+  else if (mode_ == Mode::common)
+    unmet.pressure = std::abs(ventilator_pressure(scheme_.flow(volume)) - target_);
+  return unmet;
 }
 
 bool Airway::satisfied() const

@@ -34,6 +34,20 @@ double EnergyBalance::relative_residual() const
   return exchanged > 0 ? std::abs(residual) / exchanged : 0;
 }
 
+double EnergyAudit::worst_residual() const
+{
+  double worst = 0;
+  for (const EnergyBalance &row : rows_) worst = std::max(worst, std::abs(row.residual));
+  return worst;
+}
+
+double EnergyAudit::worst_share() const
+{
+  constexpr double strain = 1e-6;
+  const double least = model_.modulus() * scene_.mesh().volume() * strain * strain * units::j_per_kPa_mm3;
+  return worst_residual() / std::max(rows_.back().exchanged, least);
+}
+
 std::size_t EnergyAudit::account(const std::string &name, Energy kind)
 {
   const auto found =

@@ -9,6 +9,13 @@
 
 namespace pulmo {
 
+namespace {
+
+/// Nodes that hold one value by different sums differ by less than this share of it.
+constexpr PetscReal rounding = 1e-14;
+
+} // namespace
+
 PetscErrorCode Model::declare(Options &options, const Elements &elements)
 {
   const PetscInt k = elements.displacement;
@@ -280,6 +287,12 @@ PetscErrorCode Model::create_section()
   }
   PetscCall(find_airway(constraint_of));
   if (closes_rows_) PetscCall(find_carrier());
+  PetscInt n_known;
+  IS *rows;
+  PetscCall(DMCreateFieldIS(dm_, &n_known, nullptr, &rows));
+  field_rows_.resize(static_cast<std::size_t>(n_known));
+  for (PetscInt f = 0; f < n_known; ++f) *field_rows_[f].out() = rows[f];
+  PetscCall(PetscFree(rows));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -431,7 +444,10 @@ PetscErrorCode Model::find_carrier()
     if (rank == carrier_rank_) {
       PetscCall(PetscSectionGetDof(global, cell, &dof));
       PetscCall(PetscSectionGetOffset(global, cell, &carrier_));
-      for (PetscInt d = 0; d < dof; ++d) closed_rows_.push_back(carrier_ + d);
+      for (PetscInt d = 0; d < dof; ++d) {
+        closed_rows_.push_back(carrier_ + d);
+        if (d > 0) idle_rows_.push_back(carrier_ + d);
+      }
     }
   } else {
     PetscMPIInt first = closed_rows_.empty() ? PETSC_MPI_INT_MAX : rank;
@@ -514,15 +530,85 @@ PetscErrorCode Model::constrain_rate(Vec local, Vec before, PetscReal dt, Vec ra
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Model::close_rows(Vec F) const
+PetscErrorCode Model::close_rows(Vec X, Vec F) const
 {
   PetscFunctionBeginUser;
   if (airway_held_ && !closed_rows_.empty()) {
     PetscInt first;
     PetscCall(VecGetOwnershipRange(F, &first, nullptr));
+    const ReadArray x(X);
     WriteArray f(F);
-    for (const PetscInt row : closed_rows_) f[row - first] = 0;
+    for (const PetscInt row : closed_rows_) {
+      const PetscScalar off = x[row - first] - step_.gas_pressure;
+      f[row - first] = std::abs(off) > rounding * std::abs(step_.gas_pressure) ? off : 0;
+    }
+    for (const PetscInt row : idle_rows_) f[row - first] = x[row - first];
   }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::residual_sums(Vec F, std::vector<PetscReal> &sums) const
+{
+  PetscInt first;
+
+  PetscFunctionBeginUser;
+  sums.assign(field_rows_.size(), 0);
+  PetscCall(VecGetOwnershipRange(F, &first, nullptr));
+  {
+    const ReadArray f(F);
+    for (std::size_t field = 0; field < field_rows_.size(); ++field) {
+      const PetscInt *rows;
+      PetscInt n;
+      PetscCall(ISGetLocalSize(field_rows_[field], &n));
+      PetscCall(ISGetIndices(field_rows_[field], &rows));
+      for (PetscInt i = 0; i < n; ++i) sums[field] += std::abs(f[rows[i] - first]) / row_scale_[field];
+      PetscCall(ISRestoreIndices(field_rows_[field], &rows));
+    }
+  }
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, sums.data(), static_cast<PetscMPIInt>(sums.size()), MPIU_REAL, MPI_SUM,
+                             PetscObjectComm((PetscObject)F)));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::loads(PetscReal t, Vec local, Vec F, PetscReal &sum)
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
+  PetscSection section;
+  PetscInt begin, end;
+  Vec rest, zero, force, total;
+  std::vector<PetscReal> sums;
+
+  PetscFunctionBeginUser;
+  PetscReal borne = 0;
+  {
+    const ReadArray f(F);
+    for (const Prescribed &p : prescribed_)
+      if (composition().constraints()[p.constraint].field == displacement)
+        borne += std::abs(f[p.dof]) / row_scale_[displacement];
+  }
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &borne, 1, MPIU_REAL, MPI_SUM, comm));
+  for (Vec *v : {&rest, &zero, &force}) PetscCall(DMGetLocalVector(dm_, v));
+  PetscCall(DMGetGlobalVector(dm_, &total));
+  PetscCall(VecZeroEntries(zero));
+  PetscCall(VecCopy(local, rest));
+  PetscCall(DMGetLocalSection(dm_, &section));
+  PetscCall(PetscSectionGetChart(section, &begin, &end));
+  {
+    WriteArray x(rest);
+    for (PetscInt p = begin; p < end; ++p) {
+      PetscInt dofs, offset;
+      PetscCall(PetscSectionGetFieldDof(section, p, displacement, &dofs));
+      PetscCall(PetscSectionGetFieldOffset(section, p, displacement, &offset));
+      std::fill_n(x.data() + offset, dofs, 0);
+    }
+  }
+  PetscCall(residual(t, rest, zero, force));
+  PetscCall(VecZeroEntries(total));
+  PetscCall(DMLocalToGlobal(dm_, force, ADD_VALUES, total));
+  PetscCall(residual_sums(total, sums));
+  sum = sums[displacement] + borne;
+  PetscCall(DMRestoreGlobalVector(dm_, &total));
+  for (Vec *v : {&rest, &zero, &force}) PetscCall(DMRestoreLocalVector(dm_, v));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -83,6 +83,7 @@ PetscErrorCode Simulation::persist(Archive &archive)
   PetscCall(archive.value("support_reaction_kPa_mm2", worst_reaction_));
   if (model_.composition().pinned()) PetscCall(pins_.persist(archive));
   PetscCall(archive.value("min_J", min_J_));
+  PetscCall(balance_.persist(archive));
   if (archive.reading()) PetscCall(resume(archive, index, wanted_dt, phase_end));
   PetscCall(airway_.persist(archive));
   PetscCall(archive.local("state", before_));

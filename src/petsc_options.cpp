@@ -117,8 +117,8 @@ PetscErrorCode Options::check_petsc() const
       PetscCall(parse_number(option, value, number.unit, number.range, parsed));
       PulmoUserCheck(!number.whole || parsed == std::floor(parsed), comm_, "option %s takes a whole number, not '%s'",
                      option.c_str(), value.c_str());
-      PulmoUserCheck(parsed != 0 || number.range.low >= 0, comm_,
-                     "option %s 0 is out of range; take 1 or more, or -1 or -2 for once", option.c_str());
+      PulmoUserCheck((parsed != 0 && parsed != -1) || number.range.low >= 0, comm_,
+                     "option %s %s is out of range; take 1 or more, or -2 for once", option.c_str(), value.c_str());
     }
     for (const Types &type : types) {
       void (*found)(void) = nullptr;
@@ -136,6 +136,7 @@ PetscErrorCode Options::check_petsc() const
                      value.c_str());
     }
   }
+  PetscCall(check_refused(given));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -1,62 +1,17 @@
 #include "pulmo/pulmo.hpp"
 
 #include "pulmo/checkpoint.hpp"
+#include "pulmo/errors.hpp"
 #include "pulmo/held.hpp"
 
 #include <algorithm>
 #include <csignal>
 #include <cstring>
+#include <sstream>
 
 namespace pulmo {
 
 namespace {
-
-/// What a user is told of an error that PETSc found in an option's value; empty for every other error.
-std::string option_error(PetscErrorCode code, const std::string &message, const std::string &function)
-{
-  const std::string first_line = message.substr(0, message.find('\n')), no_number = "Input string ";
-  if (code == PETSC_ERR_ARG_UNKNOWN_TYPE) // -pc_type lemon
-    return first_line + ": a PETSc option names a type that this PETSc does not have; check its spelling";
-  if (message.rfind(no_number, 0) != 0) // -pc_fieldsplit_type lemon
-    return function.rfind("PetscOptions", 0) == 0
-               ? first_line + ": mend that option of PETSc's (-help lists its values)"
-               : "";
-  // -ts_dt short: PETSc names the word only
-  const std::string word = message.substr(no_number.size(), message.find(' ', no_number.size()) - no_number.size());
-  OptionList given;
-  std::string option = "an option";
-  (void)Options(PETSC_COMM_WORLD).all_given(given);
-  for (const auto &[name, value] : given)
-    if (value == word) option = "option " + name;
-  return option + " takes a number, not '" + word + "'";
-}
-
-/// Whether a code is one of pulmo's own, of an error told in a sentence.
-bool is_own(PetscErrorCode code)
-{
-  return code == PETSC_ERR_USER_INPUT || code == PULMO_ERR_COULD_NOT_GO_ON || code == PULMO_ERR_STOPPED;
-}
-
-/// pulmo's own errors: one sentence from one rank. Everything else: PETSc's trace.
-PetscErrorCode handle_error(MPI_Comm comm, int line, const char *function, const char *file, PetscErrorCode code,
-                            PetscErrorType type, const char *message, void *context)
-{
-  std::string text = message ? message : "";
-  if (!is_own(code)) {
-    text = type == PETSC_ERROR_INITIAL ? option_error(code, text, function ? function : "") : "";
-    if (text.empty()) return PetscTraceBackErrorHandler(comm, line, function, file, code, type, message, context);
-    code = PETSC_ERR_USER_INPUT;
-  }
-  if (type == PETSC_ERROR_INITIAL) {
-    PetscMPIInt rank = 0; // options are the same on all ranks, so all ranks are here
-    (void)MPI_Comm_rank(PETSC_COMM_WORLD, &rank);
-    if (rank == 0) {
-      std::fflush(stdout);
-      std::fprintf(stderr, "pulmo: error: %s\n", text.c_str());
-    }
-  }
-  return code; // callers get what the handler returns
-}
 
 /// A crash, or a signal before the run heeds any: no lock is left, and the exit code is not PETSc's 59.
 PetscErrorCode handle_signal(int signal, void *)
@@ -109,7 +64,8 @@ PetscErrorCode keep_last_state(Checkpoint &checkpoint, const Simulation &simulat
   std::string complaint;
 
   PetscFunctionBeginUser;
-  if (simulation.rows().size() < 2) PetscFunctionReturn(PETSC_SUCCESS); // the start is no loss
+  // the start is no loss, and at the end nothing is left to run
+  if (simulation.rows().size() < 2 || simulation.at_end()) PetscFunctionReturn(PETSC_SUCCESS);
   PetscCall(checkpoint.write(complaint));
   text = complaint.empty() ? " With another solver go on from there: -restart " + checkpoint.path() + "."
                            : " No checkpoint: " + complaint + ".";
@@ -169,6 +125,23 @@ PetscErrorCode warn_of_equal_order(MPI_Comm comm, const Scene &scene, const Mode
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+/// Holds the energy that the steps of a run lost or made against the work that was given.
+PetscErrorCode hold_energy(MPI_Comm comm, const EnergyAudit &energy, Simulation &simulation, bool &finished)
+{
+  std::ostringstream text;
+
+  PetscFunctionBeginUser;
+  text.precision(2);
+  text << energy.worst_residual() << " J without account, " << energy.worst_share() << " of the work";
+  finished = energy.worst_share() <= Balance::failure;
+  if (!finished)
+    PetscCall(simulation.end_unsolved("the run was not solved", text.str()));
+  else if (energy.worst_share() > Balance::warning)
+    PetscCall(
+        PetscPrintf(comm, "pulmo: warning: the run is hardly solved: the solver leaves %s\n", text.str().c_str()));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 } // namespace
 
 PetscErrorCode check_held(const Scene &scene, const Model &model)
@@ -189,7 +162,8 @@ PetscErrorCode initialize()
   PetscBool no_handler = PETSC_FALSE;
 
   PetscFunctionBeginUser;
-  PetscCall(PetscPushErrorHandler(handle_error, nullptr));
+  static ErrorHandler errors; // PETSc keeps a pointer to it to the end
+  PetscCall(errors.setup());
   PetscCall(PetscOptionsGetBool(nullptr, nullptr, "-no_signal_handler", &no_handler, nullptr));
   if (!no_handler) PetscCall(PetscPushSignalHandler(handle_signal, nullptr));
   (void)std::signal(SIGXFSZ, SIG_IGN); // a file that may not grow any more: the write fails, and is told
@@ -314,6 +288,7 @@ PetscErrorCode run(const Registry &registry, bool &finished)
     if (simulation.stopped()) PetscCall(stop(checkpoint, simulation, signal.name()));
     PetscCall(signal.asked(asked_to_stop)); // in the last step
   }
+  if (finished && audit_energy) PetscCall(hold_energy(comm, energy, simulation, finished));
   PetscCall(options.warn_unused());
   PetscCall(warn_of_no_air(comm, scene, simulation));
   PetscCall(simulation.pins().warn(run.model()));

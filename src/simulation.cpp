@@ -110,6 +110,7 @@ PetscErrorCode Simulation::setup()
   PetscCall(VecDuplicate(local_, local_residual_.out()));
   PetscCall(VecDuplicate(local_, before_.out()));
   PetscCall(predictor_.setup(state_));
+  balance_.setup(scene_.mesh().volume(), model_.modulus());
   PetscCall(create_solver());
   phases_ = phases();
   end_ = phases_.back().end;
@@ -235,6 +236,14 @@ PetscErrorCode Simulation::run(bool &finished)
       break;
     }
   }
+  if (finished) {
+    finished = balance_.judge_run();
+    if (!finished)
+      PetscCall(end_unsolved("the run was not solved", balance_.complaint()));
+    else if (balance_.worst() > Balance::warning)
+      PetscCall(PetscPrintf(comm, "pulmo: warning: the steps are hardly solved: the worst leaves %s\n",
+                            balance_.complaint().c_str()));
+  }
   PetscCall(PetscTime(&end));
   seconds_.total = end - begin + seconds_.setup;
   seconds_.solve = end - begin - seconds_.residual - seconds_.jacobian - seconds_.output;
@@ -278,6 +287,7 @@ PetscErrorCode Simulation::before_stage(PetscReal t)
   PetscCall(TSGetTime(ts_, &begin));
   PetscCall(TSGetTimeStep(ts_, &dt));
   PetscCall(scheme_.begin_stage(t, dt));
+  airway_.freeze(false);
   airway_.begin_stage(t, begin + dt);
   model_.set_load(std::min<PetscReal>(1, (begin + dt) / std::min(phases_.front().dt.value_or(wanted_dt_), end_)));
   extra_newton_ = 0;
@@ -344,7 +354,7 @@ PetscErrorCode Simulation::residual(PetscReal t, Vec X, Vec Xdot, Vec F)
   PetscCall(local_residual(t));
   PetscCall(VecZeroEntries(F));
   PetscCall(DMLocalToGlobal(model_.dm(), local_residual_, ADD_VALUES, F));
-  PetscCall(airway_.close(measures.volume_change, F));
+  PetscCall(airway_.close(measures.volume_change, X, F));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -364,6 +374,10 @@ PetscErrorCode Simulation::border(SNES snes, Vec X, Vec Y)
   PetscCall(airway_.pressure(local_, P));
   const PetscReal dP = share * std::max(model_.modulus(), std::abs(P));
   PetscCall(SNESGetFunction(snes, &F, nullptr, nullptr));
+  if (airway_.frozen()) { // PETSc's test of the Jacobian left its residual
+    airway_.freeze(false);
+    PetscCall(SNESComputeFunction(snes, X, F));
+  }
   PetscCall(VecCopy(X, border_x_));
   PetscCall(model_.set_airway_nodes(border_x_, P + dP));
   PetscCall(SNESComputeFunction(snes, border_x_, border_b_));
@@ -445,6 +459,7 @@ PetscErrorCode Simulation::jacobian(PetscReal t, Vec X, Vec Xdot, Mat A)
   PetscFunctionBeginUser;
   PetscCall(scatter(t, X, Xdot));
   PetscCall(model_.jacobian(t, local_, rate_, scheme_.slope(), A));
+  airway_.freeze(tests_jacobian_); // PETSc's test follows, then border()
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -494,8 +509,15 @@ PetscErrorCode Simulation::accept_stage(PetscReal t, Vec X, PetscBool *accept)
 {
   Measures measures;
   PetscReal dt;
+  SNES snes;
+  SNESConvergedReason reason;
 
   PetscFunctionBeginUser;
+  *accept = PETSC_FALSE;
+  PetscCall(TSGetSNES(ts_, &snes));
+  PetscCall(SNESGetConvergedReason(snes, &reason));
+  if (reason < 0)
+    PetscFunctionReturn(PETSC_SUCCESS); // newer PETSc asks here before it looks; after_stage() dealt with it
   PetscCall(TSGetTimeStep(ts_, &dt));
   PetscCall(airway_.apply(X));
   PetscCall(DMGlobalToLocal(model_.dm(), X, INSERT_VALUES, local_));
@@ -511,10 +533,74 @@ PetscErrorCode Simulation::accept_stage(PetscReal t, Vec X, PetscBool *accept)
       PetscCall(keep_step(dt));
       *accept = PETSC_FALSE;
     } else {
+      bool solved;
       candidate_ = {t, measures.volume_change / units::mm3_per_ml, pressure / units::kPa_per_cmH2O};
-      PetscCall(scheme_.accept_stage(model_, t, measures.volume_change, local_));
+      PetscCall(judge(t, measures.volume_change, pressure, solved));
+      *accept = PetscBool(solved);
+      if (solved)
+        PetscCall(scheme_.accept_stage(model_, t, measures.volume_change, local_));
+      else
+        PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED)); // a shorter step would be solved no better
     }
   }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Holds what the state in local_ leaves of its equations against what they balance. Fills rate_ and local_residual_.
+PetscErrorCode Simulation::judge(PetscReal t, PetscReal volume, PetscReal pressure, bool &solved)
+{
+  Vec F;
+  std::vector<PetscReal> sums;
+  PetscReal flow = scheme_.flow(volume);
+  Balance::Errors errors;
+
+  PetscFunctionBeginUser;
+  PetscCall(make_rate());
+  PetscCall(local_residual(t));
+  PetscCall(DMGetGlobalVector(model_.dm(), &F));
+  PetscCall(VecZeroEntries(F));
+  PetscCall(DMLocalToGlobal(model_.dm(), local_residual_, ADD_VALUES, F));
+  if (airway_.mode() != Airway::Mode::free) PetscCall(model_.set_airway_nodes(F, 0)); // the flux that enters there
+  PetscCall(model_.residual_sums(F, sums));
+  PetscCall(DMRestoreGlobalVector(model_.dm(), &F));
+  if (scene_.facts().airflow) PetscCall(consistent_flow(flow));
+  const Airway::Unmet unmet = airway_.unmet(volume);
+  const PetscReal lost = (scheme_.flow(volume) - flow) / scheme_.slope(),
+                  since_start = accepted_.volume * units::mm3_per_ml - delivered_ + lost;
+  errors.force = sums[displacement];
+  if (sums.size() > pulmo::pressure) errors.gas = sums[pulmo::pressure] / scheme_.slope();
+  errors.gas = std::max({errors.gas, unmet.volume, scheme_.half_step() ? 0 : std::abs(since_start)});
+  errors.pressure = unmet.pressure;
+  const auto load = [&](PetscReal &sum) { return model_.loads(t, local_, local_residual_, sum); };
+  PetscCall(balance_.judge(static_cast<int>(phase_->breath), volume, pressure, errors, load, solved));
+  std::ostringstream text;
+  text << t;
+  if (!solved) PetscCall(end_unsolved("the step to t = " + text.str() + " s was not solved", balance_.complaint()));
+  if (solved && balance_.warns())
+    PetscCall(PetscPrintf(options_.comm(),
+                          "pulmo: warning: the step to t = %g s is hardly solved: the solver leaves %s\n", (double)t,
+                          balance_.complaint().c_str()));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Simulation::end_unsolved(const std::string &what, const std::string &left)
+{
+  std::string cause;
+
+  PetscFunctionBeginUser;
+  PetscCall(options_.loosened(cause));
+  unsolved_ = what + ": the solver leaves " + left + " (0.01 at most). " + cause + ".";
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// With airflow: the flow that is prescribed, or that goes with the residual in local_residual_, mm^3/s.
+PetscErrorCode Simulation::consistent_flow(PetscReal &flow) const
+{
+  PetscFunctionBeginUser;
+  if (airway_.mode() == Airway::Mode::free)
+    flow = airway_.flow();
+  else
+    PetscCall(model_.airway_flow(local_residual_, flow));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -598,28 +684,18 @@ PetscErrorCode Simulation::after_step()
   PetscCall(DMGlobalToLocal(model_.dm(), state_, INSERT_VALUES, local_));
   PetscCall(model_.constrain(t, local_));
   PetscCall(airway_.pressure(local_, pressure));
-  PetscCall(make_rate());
   PetscCall(model_.measure(local_, measures));
   row.volume = measures.volume_change / units::mm3_per_ml;
-  const bool free = airway_.mode() == Airway::Mode::free, airflow = scene_.facts().airflow,
-             supported = model_.composition().supported();
-  if ((airflow && !free) || supported) PetscCall(local_residual(t));
-  if (supported) {
+  if (model_.composition().supported()) { // judge() left this state's residual
     std::vector<std::array<PetscReal, 3>> forces;
     PetscCall(model_.reactions(local_residual_, forces));
     for (const auto &force : forces)
       for (const PetscReal f : force) worst_reaction_ = std::max(worst_reaction_, std::abs(f));
     if (model_.composition().pinned()) PetscCall(pins_.follow(model_, forces, local_, t, pressure));
   }
-  if (free) {
-    row.flow = airway_.flow() / units::mm3_per_ml;
-  } else if (airflow) {
-    PetscReal flow;
-    PetscCall(model_.airway_flow(local_residual_, flow));
-    row.flow = flow / units::mm3_per_ml;
-  } else {
-    row.flow = scheme_.flow(measures.volume_change) / units::mm3_per_ml;
-  }
+  PetscReal flow = scheme_.flow(measures.volume_change);
+  if (scene_.facts().airflow) PetscCall(consistent_flow(flow));
+  row.flow = flow / units::mm3_per_ml;
   PetscCall(VecCopy(local_, before_));
   const bool kink = (same(t, phase_->begin + phase_->ramp) || airway_.reaches_limit()) && !same(t, phase_->end);
   airway_.accept(row.flow * units::mm3_per_ml);
@@ -677,6 +753,7 @@ PetscErrorCode Simulation::report(const SignalRow &row, const Measures &measures
 std::string Simulation::failure_text() const
 {
   std::ostringstream text;
+  if (!unsolved_.empty()) return unsolved_;
   text.precision(6);
   text << (crawled_ >= crawling_steps ? "steps only crawl at t = " : "no step could be accepted after t = ")
        << accepted_.time << " s (phase " << (phase_ ? phase_->name : "run") << ", airway pressure "

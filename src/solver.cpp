@@ -143,8 +143,7 @@ PetscErrorCode Simulation::create_solver()
   KSP ksp;
   PC pc;
   TSAdapt adapt;
-  PetscInt max_steps;
-  PetscBool own_control, has_pc, is_fieldsplit = PETSC_FALSE, is_lu = PETSC_FALSE;
+  PetscBool has_pc, is_fieldsplit = PETSC_FALSE, is_lu = PETSC_FALSE, is_cholesky = PETSC_FALSE;
   char pc_type[64] = "";
 
   PetscFunctionBeginUser;
@@ -154,6 +153,10 @@ PetscErrorCode Simulation::create_solver()
       "no linear solver: give a solver file, e.g. -options_file petsc_options/solvers/direct.opts (or -pc_type)");
   PetscCall(PetscStrcmp(pc_type, PCFIELDSPLIT, &is_fieldsplit));
   PetscCall(PetscStrcmp(pc_type, PCLU, &is_lu));
+  PetscCall(PetscStrcmp(pc_type, PCCHOLESKY, &is_cholesky));
+  PulmoUserCheck(
+      !is_cholesky || !scene_.facts().airflow, comm,
+      "-pc_type cholesky needs a symmetric matrix, and that of a scene with airflow is not; use -pc_type lu");
   if (!is_lu) PetscCall(attach_rigid_body_modes(model_.dm())); // a factorisation has no use for them
 
   PetscCall(TSCreate(comm, ts_.out()));
@@ -189,6 +192,9 @@ PetscErrorCode Simulation::create_solver()
   PetscCall(compat::set_from_options(ts_));
   PetscCall(offer_fixed_stress(ksp));
   PetscCall(lagging_.setup(snes));
+  PetscBool tests_jacobian;
+  PetscCall(PetscOptionsHasName(nullptr, nullptr, "-snes_test_jacobian", &tests_jacobian));
+  tests_jacobian_ = tests_jacobian;
   if (lagging_.in_use() || predictor_.in_use() ||
       (scene_.facts().ventilator && scene_.facts().ventilator->prescribes_flow()))
     PetscCall(SNESSetConvergenceTest(snes, newton_converged, this, nullptr));
@@ -223,10 +229,11 @@ PetscErrorCode Simulation::create_solver()
     PetscCall(VecDuplicate(local_, border_y_.out()));
   }
   PetscCall(TSGetTimeStep(ts_, &wanted_dt_));
-  PetscCall(TSGetMaxSteps(ts_, &max_steps));
-  PulmoUserCheck(max_steps == PETSC_MAX_INT, comm, "-ts_max_steps would cut a phase short; use -ts_max_time");
-  PetscCall(PetscObjectTypeCompare((PetscObject)adapt, "pulmo", &own_control));
-  PulmoUserCheck(own_control, comm, "-ts_adapt_type: pulmo cuts, regrows and lands steps itself; leave the option out");
+  PetscBool limits_steps;
+  PetscCall(PetscOptionsHasName(nullptr, nullptr, "-ts_adapt_dt_max", &limits_steps));
+  PulmoUserCheck(!limits_steps || step_control_.in_use(), comm,
+                 "-ts_adapt_dt_max: steps do not grow beyond -ts_dt unless their error chooses them; lower -ts_dt, or "
+                 "give -step_volume_tolerance and -step_pressure_tolerance");
   PetscCall(scheme_.setup(ts_, local_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -243,6 +250,9 @@ PetscErrorCode Simulation::offer_fixed_stress(KSP ksp)
   PetscCall(KSPGetPC(ksp, &pc));
   PetscCall(PetscObjectTypeCompare((PetscObject)pc, PCFIELDSPLIT, &fieldsplit));
   if (!fieldsplit || !scene_.facts().airflow) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscErrorCode (*has_schur)(void) = nullptr;
+  PetscCall(PetscObjectQueryFunction((PetscObject)pc, "PCFieldSplitGetSchurPre_C", &has_schur));
+  if (!has_schur) PetscFunctionReturn(PETSC_SUCCESS); // another -pc_fieldsplit_type
   PetscCall(PCFieldSplitGetSchurPre(pc, &type, &none));
   if (type != PC_FIELDSPLIT_SCHUR_PRE_USER) PetscFunctionReturn(PETSC_SUCCESS);
   PetscCall(model_.use_fixed_stress());

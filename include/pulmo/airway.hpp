@@ -49,13 +49,22 @@ public:
   PetscErrorCode guess(Vec X) const;
   /// Hands the step to the model; where P is an unknown its value is that of @p X.
   PetscErrorCode apply(Vec X);
-  /// Writes the scalar equation at lung volume @p volume into its row of a global residual.
-  PetscErrorCode close(PetscReal volume, Vec F);
+  /// Writes the scalar equation at lung volume @p volume into its row of a global residual at @p X.
+  PetscErrorCode close(PetscReal volume, Vec X, Vec F);
+  /// Holds a P that is an unknown at its last value for as long as @p frozen: the assembled Jacobian is that of the
+  /// residual without P and its equation.
+  bool frozen() const { return frozen_; }
+  void freeze(bool frozen) { frozen_ = frozen && mode_ == Mode::common; }
   /// Change of P in a Newton step, kPa, from the equation's value @p c, its derivative @p c_P and the changes of
   /// volume (mm^3) along the step for fixed P and per kPa.
   PetscReal change(PetscReal c, PetscReal c_P, PetscReal volume_fixed, PetscReal volume_per_P) const;
   /// Whether the volume of a flow phase was met when close() was called last.
   bool satisfied() const;
+  /// By how much lung volume @p volume misses what the phase prescribes: mm^3, or kPa at the ventilator.
+  struct Unmet {
+    PetscReal volume = 0, pressure = 0;
+  };
+  Unmet unmet(PetscReal volume) const;
   /// Takes note of an accepted step with flow @p flow, mm^3/s.
   void accept(PetscReal flow)
   {
@@ -95,6 +104,7 @@ private:
   Phase phase_;
   Mode mode_ = Mode::held;
   bool limited_ = false, limited_before_ = false; ///< the limit is held now, was held in the step before
+  bool frozen_ = false;                           ///< freeze()
   bool retake_ = false;                           ///< the next attempt is the first one with the limit held
   PetscReal pressure_ = 0, pressure_before_ = 0;  ///< at the airway now, before the step, kPa
   PetscReal ventilator_before_ = 0;               ///< at the ventilator before the step, kPa

@@ -45,6 +45,9 @@ public:
   PetscErrorCode persist(Archive &archive, Vec local) override;
 
   const std::vector<EnergyAccount> &accounts() const { return accounts_; }
+  /// The largest residual of the run, and that as a share of what was given (a strain of a millionth at least), J.
+  double worst_residual() const;
+  double worst_share() const;
   /// Since the start of the run, one entry per row of the signals.
   const std::vector<EnergyBalance> &rows() const { return rows_; }
 

@@ -33,7 +33,7 @@ public:
   void set_load(PetscReal load) { step_.load = load; }
   PetscReal load() const { return step_.load; }
   /// Whether the pressure is held on the surfaces open to the ventilator (so at the start), or free. Held nodes keep
-  /// their rows: identity in the Jacobian, zero in the residual that close_rows() leaves.
+  /// their rows: identity in the Jacobian, x - value in the residual that close_rows() leaves.
   void hold_airway(bool held) { airway_held_ = held; }
 
   /// Writes the prescribed values of time @p t into a local vector; with @p rate also (value - @p before) / dt.
@@ -43,8 +43,14 @@ public:
   /// Local residual, rows scaled. @p x and @p x_t are local vectors with constrained values in place. Rows of held
   /// nodes hold the flux that enters there.
   PetscErrorCode residual(PetscReal t, Vec x, Vec x_t, Vec F);
-  /// Zeroes the rows of held nodes and of the carrier in a global residual.
-  PetscErrorCode close_rows(Vec F) const;
+  /// Where the airway is held: writes x - value into the rows of its nodes and of the carrier in a global residual. The
+  /// value is in place in every state that is integrated, so that this is zero unless @p X holds another.
+  PetscErrorCode close_rows(Vec X, Vec F) const;
+  /// Sums of the absolute values of a global residual by field, in its units: kPa mm^2; mm^3/s.
+  PetscErrorCode residual_sums(Vec F, std::vector<PetscReal> &sums) const;
+  /// The sum of the absolute loads on the nodes, kPa mm^2: of the forces at F = I under the pressure of @p local (a
+  /// local vector), and of those that supports bear in the local residual @p F. The step must have been set.
+  PetscErrorCode loads(PetscReal t, Vec local, Vec F, PetscReal &sum);
   /// A matrix for jacobian(), of type -dm_mat_type.
   PetscErrorCode create_matrix(Mat *A) const;
   /// Global Jacobian dF/dx + shift dF/dx_t, rows scaled.
@@ -115,6 +121,8 @@ private:
   std::vector<PetscScalar> constants_;
   std::vector<AirwayNode> airway_;
   std::vector<PetscInt> closed_rows_; ///< global rows of held nodes (or of the carrier) that this rank owns
+  std::vector<PetscInt> idle_rows_;   ///< those of them that carry nothing
+  std::vector<ISHandle> field_rows_;  ///< global rows of each field that this rank owns
   PetscReal airway_area_ = 0;         ///< mm^2
   bool closes_rows_ = false, airway_held_ = true;
   PetscInt carrier_ = -1; ///< global dof, -1 on ranks that do not own it

@@ -77,6 +77,9 @@ public:
   /// Ends with a user error if one of PETSc's options that scenes and solver files use has a value that PETSc would
   /// take for something else, or would answer with a stack trace: numbers out of range, types that are not there.
   PetscErrorCode check_petsc() const;
+  /// Names the options given that let a solver pass for done when it is not, and how to fix that: a sentence without
+  /// its full stop.
+  PetscErrorCode loosened(std::string &text) const;
   /// Warns of PETSc options that nobody read, with the nearest name that is known.
   PetscErrorCode warn_unused() const;
   /// Prints every declared option (the part of -help that is pulmo's own).
@@ -110,6 +113,8 @@ private:
 
   PetscErrorCode find(const std::string &name, const std::string &default_value, const std::string &unit,
                       const std::string &range, const std::string &help, std::string &raw, bool &is_given);
+  /// Ends with a user error if one of PETSc's options in @p given does not go with pulmo.
+  PetscErrorCode check_refused(const OptionList &given) const;
   PetscErrorCode parse_number(const std::string &option, const std::string &raw, const std::string &unit,
                               const Range &range, double &value) const;
   std::string full(const std::string &name) const;

@@ -4,6 +4,7 @@
 
 #include "pulmo/airway.hpp"
 #include "pulmo/archive.hpp"
+#include "pulmo/balance.hpp"
 #include "pulmo/clinical.hpp"
 #include "pulmo/held.hpp"
 #include "pulmo/lagging.hpp"
@@ -75,6 +76,7 @@ public:
   Vec state() const { return state_; }        ///< global vector, the last accepted state
   Vec local_state() const { return before_; } ///< the same, local, constrained values in place
   PetscReal time() const { return accepted_.time; }
+  bool at_end() const { return same(accepted_.time, end_); }
   bool stopped() const { return stopped_; } ///< by a signal
   const std::vector<SignalRow> &rows() const { return rows_; }
   PetscReal mass_balance_error() const { return worst_balance_; } ///< largest of the run, mm^3
@@ -87,6 +89,8 @@ public:
   const StepControl &step_control() const { return step_control_; }
   PetscReal wanted_dt() const { return wanted_dt_; } ///< -ts_dt, s
   TS ts() const { return ts_; }
+  /// Makes failure_text() say that @p what, as the solver leaves @p left, and which options made it so.
+  PetscErrorCode end_unsolved(const std::string &what, const std::string &left);
   /// One paragraph on a run that could not go on: where, when, what was tried, what to try.
   std::string failure_text() const;
 
@@ -130,6 +134,8 @@ private:
   PetscErrorCode make_rate();
   PetscErrorCode local_residual(PetscReal t);
   PetscErrorCode scatter(PetscReal t, Vec X, Vec Xdot);
+  PetscErrorCode judge(PetscReal t, PetscReal volume, PetscReal pressure, bool &solved);
+  PetscErrorCode consistent_flow(PetscReal &flow) const;
   PetscErrorCode keep_step(PetscReal dt);
   PetscErrorCode fail(PetscReal dt, const std::string &reason, PetscInt newton, const Measures &measures, bool inverted,
                       bool retry);
@@ -153,6 +159,8 @@ private:
   Airway airway_;
   StepControl step_control_;
   StepControl::Value candidate_; ///< at the end of the step that is to be accepted
+  Balance balance_;
+  std::string unsolved_; ///< why the run ends, if it is not solved
   Predictor predictor_;
   PinForces pins_;
   Lagging lagging_;
@@ -175,14 +183,15 @@ private:
   void (*multiply_)() = nullptr; ///< PETSc's product with matrix_
   struct {
     Vec step = nullptr, product = nullptr;
-  } bordered_;               ///< a bordered step and the residual at its start, until the search along it begins
-  PetscReal start_norm_ = 0; ///< residual of the attempt at hand before any Newton step and guess
-  int extra_newton_ = 0;     ///< Newton steps of the attempt at hand for the prescribed volume alone
-  bool inverted_ = false;    ///< the attempt at hand met J <= 0
-  bool cut_ = false;         ///< the step at hand was cut
-  bool resumed_ = false;     ///< the run goes on from what was read
-  bool stopped_ = false;     ///< by a signal
-  int crawled_ = 0;          ///< accepted steps in a row that were tiny
+  } bordered_;                  ///< a bordered step and the residual at its start, until the search along it begins
+  PetscReal start_norm_ = 0;    ///< residual of the attempt at hand before any Newton step and guess
+  int extra_newton_ = 0;        ///< Newton steps of the attempt at hand for the prescribed volume alone
+  bool inverted_ = false;       ///< the attempt at hand met J <= 0
+  bool tests_jacobian_ = false; ///< -snes_test_jacobian
+  bool cut_ = false;            ///< the step at hand was cut
+  bool resumed_ = false;        ///< the run goes on from what was read
+  bool stopped_ = false;        ///< by a signal
+  int crawled_ = 0;             ///< accepted steps in a row that were tiny
   Measures inverted_measures_;
   std::vector<FailedAttempt> failures_;
   StageSeconds seconds_;

@@ -1,0 +1,97 @@
+#include "pulmo/balance.hpp"
+
+#include "pulmo/units.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <sstream>
+
+namespace pulmo {
+
+namespace {
+
+/// What volumes and loads count as at least, as a share of the lung's volume, or of the modulus: in a step, and over
+/// the run (rounding).
+constexpr PetscReal least_in_step = 1e-3, least_in_run = 1e-8;
+
+constexpr double newton_per_kPa_mm2 = 1e-3;
+
+} // namespace
+
+void Balance::setup(PetscReal lung, PetscReal modulus)
+{
+  lung_ = lung;
+  modulus_ = modulus;
+}
+
+PetscReal Balance::share(const Errors &errors, PetscReal least, std::string &text) const
+{
+  const PetscReal surface = 6 * std::cbrt(lung_ * lung_); // of a cube
+  const PetscReal gas = errors.gas / std::max(size_.gas, least * lung_),
+                  force = errors.force / std::max(size_.force, least * modulus_ * surface),
+                  pressure = errors.pressure / std::max(size_.pressure, least * modulus_);
+  const PetscReal largest = std::isfinite(gas + force + pressure) ? std::max({gas, force, pressure}) : PETSC_INFINITY;
+  std::ostringstream words;
+  words.precision(2);
+  if (gas == largest)
+    words << errors.gas / units::mm3_per_ml << " ml of gas, " << gas << " of what the lung took in and gave back";
+  else if (force == largest)
+    words << "forces of " << errors.force * newton_per_kPa_mm2 << " N without balance, " << force << " of the load";
+  else
+    words << "a difference of " << errors.pressure / units::kPa_per_cmH2O << " cmH2O to the ventilator's pressure, "
+          << pressure << " of it";
+  text = words.str();
+  return largest;
+}
+
+PetscErrorCode Balance::judge(int breath, PetscReal volume, PetscReal pressure, const Errors &errors,
+                              const std::function<PetscErrorCode(PetscReal &)> &load, bool &solved)
+{
+  PetscFunctionBeginUser;
+  if (breath != breath_) {
+    if (breath_ == 0) size_.gas = 0; // what filled the lung before its first breath is no tidal volume
+    lowest_ = highest_ = volume;
+  }
+  breath_ = breath;
+  lowest_ = std::min(lowest_, volume);
+  highest_ = std::max(highest_, volume);
+  size_.gas = std::max(size_.gas, highest_ - lowest_);
+  size_.pressure = std::max(size_.pressure, std::abs(pressure));
+  if (!(errors.force <= warning * size_.force)) { // an old load is no larger than the largest
+    PetscReal now;
+    PetscCall(load(now));
+    size_.force = std::max(size_.force, now);
+  }
+  const PetscReal left = share(errors, least_in_step, complaint_);
+  solved = left <= failure;
+  warns_ = !warned_ && left > warning;
+  warned_ = warned_ || warns_;
+  worst_share_ = std::max(worst_share_, left);
+  worst_.gas = std::max(worst_.gas, errors.gas);
+  worst_.force = std::max(worst_.force, errors.force);
+  worst_.pressure = std::max(worst_.pressure, errors.pressure);
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+bool Balance::judge_run()
+{
+  worst_share_ = share(worst_, least_in_run, complaint_);
+  return worst_share_ <= failure;
+}
+
+PetscErrorCode Balance::persist(Archive &archive)
+{
+  PetscFunctionBeginUser;
+  for (const auto &[name, errors] : {std::pair{"worst", &worst_}, std::pair{"size", &size_}}) {
+    const std::string path = std::string("balance/") + name;
+    PetscCall(archive.value(path + "_gas_mm3", errors->gas));
+    PetscCall(archive.value(path + "_force_kPa_mm2", errors->force));
+    PetscCall(archive.value(path + "_pressure_kPa", errors->pressure));
+  }
+  PetscCall(archive.value("balance/lowest_mm3", lowest_));
+  PetscCall(archive.value("balance/highest_mm3", highest_));
+  PetscCall(archive.value("balance/breath", breath_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace pulmo
