@@ -63,8 +63,6 @@ const Refusal refusals[] = {
     {"-snes_convergence_test", false, "default",
      "a step would pass for solved that is not; leave the option out and set -snes_rtol and -snes_atol"},
     {"-snes_grid_sequence", false, "0", "a run has one mesh; use -dm_refine"},
-    {"-snes_linesearch_type", false, "bt,basic,cp,l2,nleqerr,bisection,secant",
-     "pulmo hands over no search of its own; use bt"},
     {"-snes_error_if_not_converged", true, off, "a step that fails is taken again, shorter; leave the option out"},
     {"-ksp_error_if_not_converged", true, off, "a step that fails is taken again, shorter; leave the option out"},
     // Mat and Vec

@@ -501,7 +501,6 @@ def table(m):
         "a block that fails as an error": (good + ["-fieldsplit_pressure_ksp_error_if_not_converged"],
                                            ["-fieldsplit_pressure_ksp_error_if_not_converged", "shorter"]),
         "a Jacobian that is never made": (good + ["-snes_lag_jacobian", "-1"], ["-snes_lag_jacobian -1", "-2 for once"]),
-        "a line search of one's own": (good + ["-snes_linesearch_type", "shell"], ["-snes_linesearch_type shell", "bt"]),
         "multigrid that is applied once": (good + ["-pc_type", "gamg"], ["-ksp_type preonly", "-pc_type gamg", "fgmres"]),
         "no matrix to factorise": (good + ["-snes_mf"], ["-snes_mf", "-snes_mf_operator"]),
         "a symmetric factorisation": (good + ["-pc_type", "cholesky"], ["-pc_type cholesky", "symmetric", "lu"]),
@@ -512,7 +511,7 @@ def table(m):
         "unknown solver type of a block": (
             good + ["-pc_type", "fieldsplit", "-fieldsplit_pressure_pc_type", "lemon"],
             ["-fieldsplit_pressure_pc_type", "'lemon'", "check its spelling"]),
-        "unknown way to split": (good + ["-pc_type", "fieldsplit", "-pc_fieldsplit_type", "banana"],
+        "unknown way to split": (good + ["-ksp_type", "fgmres", "-pc_type", "fieldsplit", "-pc_fieldsplit_type", "banana"],
                           ["-pc_fieldsplit_type", "banana", "schur"]),
         "unknown Krylov method": (good + ["-ksp_type", "lemon"], ["-ksp_type", "'lemon'", "check its spelling"]),
         "unknown Newton method": (good + ["-snes_type", "lemon"], ["-snes_type", "'lemon'", "check its spelling"]),

@@ -87,6 +87,21 @@ class Unsolved(unittest.TestCase):
         case = pulmo.finished(PCV + ["-snes_fd_color"])
         np.testing.assert_allclose(case.signals()["volume_ml"], volume, rtol=1e-6)
 
+    def test_errors_of_petscs_solvers(self):
+        """What only PETSc finds is a sentence, too, that quotes it and the options."""
+        for chosen in (["-pc_type", "ilu", "-ksp_type", "gmres"], ["-pc_type", "bddc", "-ksp_type", "gmres"],
+                       ["-ksp_type", "fetidp"], ["-snes_linesearch_type", "shell"]):
+            for ranks in (1, 2):
+                with self.subTest(chosen, ranks=ranks):
+                    case = pulmo.Case(PCV + chosen, ranks=ranks)
+                    said = f"{case.command}\n{case.tail()}"
+                    self.assertEqual(case.code, 1, said)
+                    lines = [line for line in case.err.splitlines() if line.startswith("pulmo: error: ")]
+                    self.assertEqual(len(lines), 1, said)
+                    self.assertIn(" ".join(chosen[:2]), lines[0])
+                    self.assertIn("petsc_options/solvers", lines[0])
+                    self.assertNotIn("PETSC ERROR", case.err, said)
+
 
 if __name__ == "__main__":
     pulmo.main()
