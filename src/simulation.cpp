@@ -6,7 +6,6 @@
 #include <cmath>
 #include <petsc/private/snesimpl.h>
 #include <petsc/private/tsimpl.h>
-#include <sstream>
 
 namespace pulmo {
 
@@ -43,33 +42,6 @@ constexpr int max_extra_newton = 3;
 
 /// Failed attempts that are remembered.
 constexpr std::size_t max_failures = 12;
-
-/// At a limit point volume follows pressure more steeply than on the way there, by this factor at least: dV/dP goes to
-/// infinity, and steps end far closer to it than this asks for.
-constexpr double limit_steepness = 5;
-
-/// No cell that has less than this J is well.
-constexpr double well_formed = 0.5;
-
-/// Says so if the last rows, of a phase that prescribes pressure, end at a limit point; empty if not.
-std::string limit_point(const std::vector<SignalRow> &rows)
-{
-  std::ostringstream text;
-  std::size_t first = rows.size() - 1;
-  while (first > 0 && rows[first - 1].phase == rows.back().phase && rows[first - 1].breath == rows.back().breath)
-    --first;
-  if (first + 2 >= rows.size()) return "";
-  const SignalRow &begin = rows[first], &before = rows[rows.size() - 2], &end = rows.back();
-  const double last = (end.volume - before.volume) / (end.pressure - before.pressure),
-               way = (before.volume - begin.volume) / (before.pressure - begin.pressure);
-  if (!(end.pressure > before.pressure && before.pressure > begin.pressure && last > limit_steepness * way)) return "";
-  text.precision(4);
-  text << " Volume follows pressure ever more steeply, by " << last << " ml/cmH2O in the last step and " << way
-       << " on the way there: a limit point. There is no equilibrium above ";
-  text.precision(6);
-  text << end.pressure << " cmH2O.";
-  return text.str();
-}
 
 class Stopwatch {
 public:
@@ -244,6 +216,8 @@ PetscErrorCode Simulation::run(bool &finished)
       PetscCall(PetscPrintf(comm, "pulmo: warning: the steps are hardly solved: the worst leaves %s\n",
                             balance_.complaint().c_str()));
   }
+  if (!finished && !stopped_ && unsolved_.empty())
+    PetscCall(diagnose(scene_, model_, failure_facts(), before_, diagnosis_));
   PetscCall(PetscTime(&end));
   seconds_.total = end - begin + seconds_.setup;
   seconds_.solve = end - begin - seconds_.residual - seconds_.jacobian - seconds_.output;
@@ -750,45 +724,21 @@ PetscErrorCode Simulation::report(const SignalRow &row, const Measures &measures
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+FailureFacts Simulation::failure_facts() const
+{
+  FailureFacts facts;
+  facts.attempts = failures_;
+  facts.rows = rows_;
+  facts.crawled = crawled_ >= crawling_steps;
+  facts.free_flow = airway_.mode() == Airway::Mode::free;
+  facts.prescribes_pressure = phase_ && phase_->control == Control::pressure;
+  if (phase_) facts.phase = phase_->name;
+  return facts;
+}
+
 std::string Simulation::failure_text() const
 {
-  std::ostringstream text;
-  if (!unsolved_.empty()) return unsolved_;
-  text.precision(6);
-  text << (crawled_ >= crawling_steps ? "steps only crawl at t = " : "no step could be accepted after t = ")
-       << accepted_.time << " s (phase " << (phase_ ? phase_->name : "run") << ", airway pressure "
-       << accepted_.pressure << " cmH2O, volume " << accepted_.volume << " ml, tissue law "
-       << scene_.tissue().law().name() << ", J from " << accepted_.min_J << " to " << accepted_.max_J << ").";
-  const auto inverted = std::find_if(failures_.rbegin(), failures_.rend(), [](const auto &f) { return f.inverted; });
-  if (inverted != failures_.rend())
-    text << " The tissue turned inside out: J = " << inverted->measures.min_J << " in the cell at ("
-         << inverted->measures.where[0] << ", " << inverted->measures.where[1] << ", " << inverted->measures.where[2]
-         << ") mm (cell " << inverted->measures.cell << " of rank " << inverted->measures.rank << ").";
-  text << " Tried";
-  for (const FailedAttempt &f : failures_) {
-    text << (&f == &failures_.front() ? " " : ", ") << "dt " << f.dt << " s (" << f.reason;
-    if (f.newton > 0) text << " after " << f.newton << " Newton steps" << (f.inverted ? ", J <= 0 on the way" : "");
-    text << ")";
-  }
-  text << ".";
-  // tissue that folds at a rim gives way, too; at a limit point all of it is well, and only attempts turn it inside out
-  const bool well = accepted_.min_J > well_formed && phase_ && phase_->control == Control::pressure;
-  const std::string limit = well ? limit_point(rows_) : "";
-  text << limit << " What to try: ";
-  if (!limit.empty())
-    text << "less pressure, prescribed flow (-ventilator vcv), which goes on beyond the limit point, more that holds "
-            "the lung "
-            "(-chest_wall), another -tissue.";
-  else if (inverted != failures_.rend())
-    text << "-lumen_pressure if that cell is at the airway, a finer mesh there, a slower rise of pressure or flow, "
-            "another -tissue.";
-  else
-    text << "another file of petsc_options/solvers, a smaller -ts_dt, a larger -snes_max_it, a slower rise of pressure "
-            "or "
-            "flow, -snes_linesearch_type basic where volume is far stiffer than shape; -snes_monitor and -ksp_monitor "
-            "show "
-            "where it stalls.";
-  return text.str();
+  return unsolved_.empty() ? pulmo::failure_text(scene_, failure_facts(), diagnosis_) : unsolved_;
 }
 
 } // namespace pulmo

@@ -76,6 +76,22 @@ Json regions_json(const RegionAudit &audit, const BreathRows &breath, bool gas)
   return json;
 }
 
+/// Where and why a run could not go on.
+Json diagnosis_json(const Diagnosis &d)
+{
+  Json json = {{"where", d.name()},
+               {"mean_jacobian", d.mean_J},
+               {"inflation_stiffness_cmH2O", d.inflation / units::kPa_per_cmH2O},
+               {"acoustic_stiffness_kPa", d.acoustic},
+               {"acoustic_stiffness_at_rest_kPa", d.acoustic_at_rest},
+               {"not_elliptic_volume_share", d.lost_share},
+               {"worst_cell_mm", nullptr},
+               {"distance_from_rim_mm", nullptr}};
+  if (d.worst) json["worst_cell_mm"] = {d.worst->where[0], d.worst->where[1], d.worst->where[2]};
+  if (d.from_rim) json["distance_from_rim_mm"] = *d.from_rim;
+  return json;
+}
+
 /// Error bars by the key of their number, and the runs they come from.
 Json errors_json(const ErrorReport &report)
 {
@@ -126,6 +142,7 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
     Json json;
     json["finished"] = finished;
     if (!finished) json["failure"] = simulation.failure_text();
+    if (!finished) json["diagnosis"] = diagnosis_json(simulation.diagnosis());
     const auto frc = scene.functional_residual_capacity();
     const std::vector<SignalRow> rows = audits.regions.complete(simulation.rows());
     if (scene.facts().ventilator) {

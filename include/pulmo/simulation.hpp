@@ -6,6 +6,7 @@
 #include "pulmo/archive.hpp"
 #include "pulmo/balance.hpp"
 #include "pulmo/clinical.hpp"
+#include "pulmo/failure.hpp"
 #include "pulmo/held.hpp"
 #include "pulmo/lagging.hpp"
 #include "pulmo/model.hpp"
@@ -36,15 +37,6 @@ public:
   virtual PetscErrorCode observe(const StepReport &) = 0;
   /// Writes or reads what it remembers of the run so far. @p local: the state of the last row, as in StepReport.
   virtual PetscErrorCode persist(Archive &, [[maybe_unused]] Vec local) { return PETSC_SUCCESS; }
-};
-
-/// An attempt at a step that was not accepted.
-struct FailedAttempt {
-  PetscReal time, dt; ///< where the step began and how long it was, s
-  std::string reason;
-  PetscInt newton;
-  Measures measures; ///< of the last state with J <= 0, if any
-  bool inverted;
 };
 
 /// Wall seconds by stage, largest over the ranks at the end.
@@ -93,6 +85,8 @@ public:
   PetscErrorCode end_unsolved(const std::string &what, const std::string &left);
   /// One paragraph on a run that could not go on: where, when, what was tried, what to try.
   std::string failure_text() const;
+  /// Where and why such a run ended.
+  const Diagnosis &diagnosis() const { return diagnosis_; }
 
   // what PETSc calls back
   PetscErrorCode residual(PetscReal t, Vec X, Vec Xdot, Vec F);
@@ -117,6 +111,7 @@ public:
 
 private:
   PetscErrorCode create_solver();
+  FailureFacts failure_facts() const;
   /// The row at t = 0.
   PetscErrorCode start();
   PetscErrorCode persist_rows(Archive &archive);
@@ -194,6 +189,7 @@ private:
   int crawled_ = 0;             ///< accepted steps in a row that were tiny
   Measures inverted_measures_;
   std::vector<FailedAttempt> failures_;
+  Diagnosis diagnosis_; ///< of a run that could not go on
   StageSeconds seconds_;
 };
 

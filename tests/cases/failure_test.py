@@ -1,0 +1,80 @@
+#!/usr/bin/python3
+"""A run that could not go on says where: at the airway's rim, everywhere, or in the solver; the same on any number of ranks."""
+import unittest
+
+import defaults_test
+import pulmo_case as pulmo
+
+WORDS = {"airway rim": "Where: at the airway's rim.", "everywhere": "Where: everywhere. The law ", "inside": "Where: inside the lung",
+         "solver": "Where: in the solver. "}
+FREE = pulmo.DIRECT + pulmo.BLOCK + pulmo.QUIET + pulmo.STILL
+
+
+class Failure(unittest.TestCase):
+    def expect(self, where, options, *words, ranks=1):
+        case = pulmo.Case(options, ranks=ranks)
+        self.assertEqual(case.code, 2, case.tail())
+        failure = case.json("failure.json")
+        self.assertEqual(failure["diagnosis"]["where"], where, case.err)
+        for name, text in WORDS.items():
+            self.assertEqual(text in case.err, name == where, case.err)
+        for word in words:
+            self.assertIn(word, case.err)
+        return case, failure["diagnosis"]
+
+    def test_rim(self):
+        """CM1 swells into its airway where only springs bear the wall."""
+        scene = pulmo.DIRECT + pulmo.PCV + pulmo.LUNG + pulmo.QUIET + [
+            "-tissue", "berger", "-ventilator_pip", "20", "-ts_adapt_dt_min", "1e-3", "-ts_max_time", "0.3"]
+        for ranks in (1, 2):
+            case, found = self.expect("airway rim", scene, "What to try: -lumen_pressure (here it is off", ranks=ranks)
+            self.assertLess(found["distance_from_rim_mm"], 30)
+            self.assertNotIn("The solver", case.err)
+
+    def test_limit_point(self):
+        """CM4 without springs has no equilibrium above 16.83 cmH2O: dp/dJ vanishes at J = 2.534, and it stays elliptic."""
+        scene = FREE + pulmo.ROLLERS + ["-tissue", "yoshihara", "-ventilator", "pcv", "-ventilator_pip", "20",
+                                        "-ventilator_ramp", "1", "-ts_max_time", "1"]
+        for ranks in (1, 2):
+            case, found = self.expect("everywhere", scene, "yoshihara has no stiffness left at this stretch: at the mean J = 2.5",
+                                      "There is no equilibrium above 16.8", "acoustic tensor", ranks=ranks)
+            self.assertAlmostEqual(found["mean_jacobian"], 2.534, delta=0.05)
+            self.assertLess(abs(found["inflation_stiffness_cmH2O"]), 0.5)  # 47 at rest
+            self.assertAlmostEqual(found["acoustic_stiffness_kPa"], 2 * 1.298, places=6)
+            self.assertEqual(found["not_elliptic_volume_share"], 0)
+
+    def test_ellipticity(self):
+        """Suction takes CM2 to J = 0.582, where it loses its stiffness in shear; soft springs on two faces make the state uneven."""
+        scene = FREE + ["-chest_wall", "-chest_wall_surfaces", "x0,x1", "-chest_wall_stiffness", "0.001", "-tissue", "ma"]
+        _, found = self.expect("everywhere", scene + pulmo.programme("suction 1 pressure -20 ramp 1"),
+                               "The law ma has no stiffness left at this stretch")
+        self.assertAlmostEqual(found["mean_jacobian"], 0.582, delta=0.04)
+        self.assertLess(found["acoustic_stiffness_kPa"], 0.05 * found["acoustic_stiffness_at_rest_kPa"])
+        self.assertGreater(found["not_elliptic_volume_share"], 0.1)
+        self.assertGreater(found["inflation_stiffness_cmH2O"], 10)  # volume is not what gives way
+
+    def test_solver(self):
+        """The tissue is well, and neither the linear solver nor Newton's method is let do its work."""
+        scene = pulmo.DIRECT + pulmo.PCV + pulmo.CUBE + pulmo.QUIET + ["-tissue", "yoshihara", "-ts_adapt_dt_min", "0.01"]
+        for words, flags in (("The linear solver failed", ["-ksp_type", "gmres", "-pc_type", "jacobi", "-ksp_max_it", "1",
+                                                           "-ksp_rtol", "1e-10"]),
+                             ("Newton's method stalled", ["-snes_max_it", "1", "-snes_rtol", "1e-14", "-snes_stol", "0"])):
+            with self.subTest(words):
+                _, found = self.expect("solver", scene + flags, words, "-snes_monitor and -ksp_monitor show where it stalls")
+                self.assertIsNone(found["worst_cell_mm"])
+
+    def test_shares_of_a_flow(self):
+        """A flow that is shared by area and by nothing else is told where a run fails."""
+        pair = defaults_test.bodies(large=(50.0, 0.25), small=(40.0, 1.0))
+        scene = pulmo.VCV + pair + pulmo.DIRECT + pulmo.QUIET + [
+            "-chest_wall_surfaces", "pleura", "-ventilator_tidal_volume", "40", "-ts_adapt_dt_min", "0.01",
+            "-snes_max_it", "1", "-snes_rtol", "1e-14", "-snes_stol", "0"]
+        told = ("-ventilator_flow_split uniform shares the flow by area: body_1 has 28.1 % of the airway's area and 66.1 % of the volume",
+                "What to try: -ventilator_flow_split common_pressure, ")
+        self.expect("solver", scene + pulmo.UNIFORM, *told)
+        case, _ = self.expect("solver", scene + pulmo.COMMON)
+        self.assertNotIn("shares the flow by area", case.err)
+
+
+if __name__ == "__main__":
+    pulmo.main()
