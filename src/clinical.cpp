@@ -83,6 +83,9 @@ std::vector<ClinicalEntry> clinical_entries(const ClinicalNumbers &n, const std:
       {"compliance_ml_per_cmH2O", "compliance C_rs (fit)", "ml/cmH2O", n.compliance},
       {"resistance_cmH2O_s_per_l", "resistance R (fit)", "cmH2O s/l", n.resistance},
       {"time_constant_s", "time constant R C_rs", "s", n.time_constant},
+      {"compliance_equal_weights_ml_per_cmH2O", "C_rs, equal weights, intercept", "ml/cmH2O",
+       n.equal_weight_compliance},
+      {"resistance_equal_weights_cmH2O_s_per_l", "R, equal weights, intercept", "cmH2O s/l", n.equal_weight_resistance},
       {"static_compliance_ml_per_cmH2O", "static compliance", "ml/cmH2O", n.static_compliance},
       {"dynamic_compliance_ml_per_cmH2O", "dynamic compliance", "ml/cmH2O", n.dynamic_compliance},
       {"static_curve_compliance_ml_per_cmH2O", "slope of the static curve", "ml/cmH2O", n.static_curve_compliance},
@@ -176,6 +179,34 @@ void fit_single_compartment(const std::vector<SignalRow> &rows, std::size_t firs
   numbers.time_constant = R / E;
 }
 
+void fit_with_intercept(const std::vector<SignalRow> &rows, std::size_t first, std::size_t last,
+                        ClinicalNumbers &numbers)
+{
+  const auto count = static_cast<double>(last - first);
+  double V = 0, Q = 0, P = 0; // means
+  for (std::size_t i = first + 1; i <= last; ++i) {
+    V += rows[i].volume / count;
+    Q += rows[i].flow / count;
+    P += rows[i].machine_pressure() / count;
+  }
+  double VV = 0, VQ = 0, QQ = 0, PV = 0, PQ = 0;
+  for (std::size_t i = first + 1; i <= last; ++i) {
+    const double v = rows[i].volume - V, q = rows[i].flow - Q, p = rows[i].machine_pressure() - P;
+    VV += v * v;
+    VQ += v * q;
+    QQ += q * q;
+    PV += p * v;
+    PQ += p * q;
+  }
+  const double determinant = VV * QQ - VQ * VQ;
+  if (!(determinant > 1e-12 * VV * QQ)) return;
+  const double E = (PV * QQ - PQ * VQ) / determinant, R = (PQ * VV - PV * VQ) / determinant;
+  if (!(E > 0)) return;
+  numbers.equal_weight_compliance = 1 / E;
+  if (!rows[last].flow_resistance) return; // as above
+  numbers.equal_weight_resistance = R * 1000;
+}
+
 ClinicalNumbers clinical_numbers(const std::vector<SignalRow> &rows, std::size_t first, std::size_t last)
 {
   ClinicalNumbers n;
@@ -205,6 +236,7 @@ ClinicalNumbers clinical_numbers(const std::vector<SignalRow> &rows, std::size_t
   const double duration = end.time - start.time;
   n.mechanical_power = duration > 0 ? n.work * 60 / duration : 0;
   fit_single_compartment(rows, first, last, n.peep, n);
+  fit_with_intercept(rows, first, last, n);
   return n;
 }
 

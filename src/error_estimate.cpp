@@ -87,24 +87,6 @@ private:
   bool pushed_ = false;
 };
 
-/// Names and values of the database; unlike Options::all_given() with blanks and dashes in values as they are.
-PetscErrorCode given_options(const Options &options, OptionList &list)
-{
-  OptionList words;
-
-  PetscFunctionBeginUser;
-  PetscCall(options.all_given(words));
-  for (const auto &[name, printed] : words) {
-    char value[4096] = "";
-    PetscBool there;
-    PetscCall(PetscOptionsHasName(nullptr, nullptr, name.c_str(), &there)); // else a word of a value
-    if (!there) continue;
-    PetscCall(PetscOptionsGetString(nullptr, nullptr, name.c_str(), value, sizeof(value), nullptr));
-    list.emplace_back(name, value);
-  }
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
 /// How many times larger the cells of @p other are than those of @p level.
 double cell_size_ratio(const ErrorLevel &level, const ErrorLevel &other)
 {
@@ -273,7 +255,51 @@ PetscErrorCode ErrorEstimate::check(const Options &options, const Scene &scene) 
   }
   PulmoUserCheck(scene.facts().ventilator, options.comm(),
                  "-error_estimate gives the errors of clinical numbers: it needs -ventilator");
-  if (!mesh_.empty()) PetscCall(check_mesh_file(options.comm(), "-error_estimate_mesh", mesh_));
+  if (!mesh_.empty()) {
+    PetscCall(check_mesh_file(options.comm(), "-error_estimate_mesh", mesh_));
+    PetscCall(try_other_mesh(options, scene));
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Whether the scene can be set up on the other mesh: what is wrong with it is said before the run, not after it.
+PetscErrorCode ErrorEstimate::try_other_mesh(const Options &options, const Scene &scene) const
+{
+  const auto level_of = [](const Scene &of) {
+    ErrorLevel level;
+    level.cells = of.mesh().cells();
+    level.volume = of.mesh().volume() / units::mm3_per_ml;
+    return level;
+  };
+  OptionList list, changes;
+  std::string name;
+  OptionsInForce in_force;
+  Options others(options.comm());
+  Scene other(registry_);
+
+  PetscFunctionBeginUser;
+  PetscCall(other_mesh(changes, name));
+  PetscCall(level_options(options, changes, list));
+  PetscCall(in_force.put(list));
+  PetscCall(other.declare(others));
+  PetscCall(other.prepare(others));
+  Composition composition(other.mesh(), other.facts().elements);
+  PetscCall(other.compose(composition));
+  PetscCall(check_held(options.comm(), other, composition));
+  ErrorLevel level = level_of(other);
+  level.name = name;
+  PetscCall(check_other_mesh(options.comm(), level_of(scene), level));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// The options of the run, but of what it leaves behind, with @p changes.
+PetscErrorCode ErrorEstimate::level_options(const Options &options, const OptionList &changes, OptionList &list) const
+{
+  PetscFunctionBeginUser;
+  PetscCall(options.all_given(list));
+  list.erase(std::remove_if(list.begin(), list.end(), [](const auto &o) { return is_output_option(o.first); }),
+             list.end());
+  list.insert(list.end(), changes.begin(), changes.end()); // the last one counts
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -314,17 +340,14 @@ PetscErrorCode ErrorEstimate::run_level(const Options &options, const Output &ou
 
   PetscFunctionBeginUser;
   PetscCall(PetscTime(&begin));
-  PetscCall(given_options(options, list));
-  list.erase(std::remove_if(list.begin(), list.end(), [](const auto &o) { return is_output_option(o.first); }),
-             list.end());
-  list.insert(list.end(), changes.begin(), changes.end()); // the last one counts
+  PetscCall(level_options(options, changes, list));
   OptionsInForce in_force;
   PetscCall(in_force.put(list));
 
   Run run(registry_);
   PetscCall(run.declare());
   PetscCall(run.setup());
-  PetscCall(check_held(run.scene(), run.model()));
+  PetscCall(check_held(options.comm(), run.scene(), run.model().composition()));
   Simulation &simulation = run.simulation();
   ProgressPrinter progress(comm, run.scene().facts());
   Sampling sampling;

@@ -3,8 +3,10 @@
 #include "pulmo/hdf5_image.hpp"
 #include "pulmo/node_order.hpp"
 #include "pulmo/output.hpp"
+#include "pulmo/units.hpp"
 #include "pulmo/whole_file.hpp"
 
+#include <algorithm>
 #include <array>
 #include <cmath>
 #include <filesystem>
@@ -19,7 +21,15 @@ namespace {
 /// Edges of a quadratic tetrahedron in the order of VTK and XDMF.
 constexpr std::array<std::array<int, 2>, 6> edges{{{0, 1}, {1, 2}, {0, 2}, {0, 3}, {1, 3}, {2, 3}}};
 
-/// Name of the indicators in the files; that of the flow and what they are shares of have more.
+/// Names of the fields in the files: with their units, or without one if they have none.
+constexpr const char *displacement_name = "displacement_mm", *pressure_name = "alveolar_pressure_cmH2O",
+                     *mean_J_name = "J_mean", *least_J_name = "J_min", *hydrostatic_name = "hydrostatic_stress_kPa",
+                     *von_mises_name = "von_mises_stress_kPa", *porosity_name = "porosity",
+                     *ventilation_name = "ventilation_since_breath_start", *region_name = "region_number",
+                     *tissue_error_name = "error_indicator_J", *flow_error_name = "error_indicator_flux_W",
+                     *whole_error_name = "error_indicator_J_whole";
+
+/// Marks a snapshot with indicators in a checkpoint.
 const std::string error_indicator = "error_indicator";
 
 /// What all ranks have, one after the other, on rank 0.
@@ -155,16 +165,44 @@ PetscErrorCode FieldWriter::observe(const StepReport &step)
   const bool start = step.row.dt == 0;
 
   PetscFunctionBeginUser;
+  if (scene_.facts().ventilator) PetscCall(follow_breaths(step));
   if (output_.fields_every() > 0 ? schedule_.due(step.row.time) : start || step.phase_ends)
     PetscCall(snapshot(step.row.time, step.local));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode FieldWriter::persist(Archive &archive, Vec)
+/// A breath starts from the last row before it: that is where the phase before it ends.
+PetscErrorCode FieldWriter::follow_breaths(const StepReport &step)
+{
+  PetscFunctionBeginUser;
+  if (!breath_start_) {
+    PetscCall(VecDuplicate(step.local, breath_start_.out()));
+    PetscCall(VecDuplicate(step.local, phase_end_.out()));
+    PetscCall(VecCopy(step.local, breath_start_));
+    PetscCall(VecCopy(step.local, phase_end_));
+  } else if (step.row.breath != breath_) {
+    PetscCall(VecCopy(phase_end_, breath_start_));
+  }
+  breath_ = step.row.dt > 0 ? step.row.breath : 0;
+  if (step.phase_ends) PetscCall(VecCopy(step.local, phase_end_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode FieldWriter::persist(Archive &archive, Vec local)
 {
   std::string names;
 
   PetscFunctionBeginUser;
+  if (scene_.facts().ventilator) {
+    if (!breath_start_) {
+      PetscCall(VecDuplicate(local, breath_start_.out()));
+      PetscCall(VecDuplicate(local, phase_end_.out()));
+      PetscCall(VecCopy(local, breath_start_));
+    }
+    PetscCall(archive.local("breath_start", breath_start_));
+    PetscCall(archive.value("fields/breath", breath_));
+    if (archive.reading()) PetscCall(VecCopy(local, phase_end_)); // unless a phase ends here it does not count
+  }
   for (const Snapshot &s : snapshots_)
     names += s.file + " " + s.mesh + (s.error_indicator ? " " + error_indicator : "") + "\n";
   PetscCall(archive.text("fields/files", names));
@@ -294,10 +332,32 @@ PetscErrorCode FieldWriter::write_mesh()
       PetscCall(DMPlexRestoreJoin(dm, 2, ends, &n_join, &join));
     }
   }
+  std::vector<PetscScalar> regions;
+  PetscCall(region_numbers(regions));
   PetscCall(file.write("geometry", 3, geometry));
   PetscCall(file.write("topology", 10, topology));
+  PetscCall(file.write(region_name, 1, regions));
   PetscCall(file.close(output_.path(mesh_)));
   mesh_written_ = true;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode FieldWriter::region_numbers(std::vector<PetscScalar> &numbers) const
+{
+  std::vector<Mesh::Region> regions;
+
+  PetscFunctionBeginUser;
+  PetscCall(scene_.mesh().regions(regions));
+  std::vector<PetscInt> size;
+  for (const Mesh::Region &region : regions) size.push_back(static_cast<PetscInt>(region.cells.size()));
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, size.data(), static_cast<PetscMPIInt>(size.size()), MPIU_INT, MPI_SUM,
+                             PetscObjectComm((PetscObject)model_.dm())));
+  std::vector<std::size_t> smallest(static_cast<std::size_t>(model_.assembly().cells()), regions.size());
+  for (std::size_t r = 0; r < regions.size(); ++r)
+    for (const PetscInt c : regions[r].cells)
+      if (smallest[c] == regions.size() || size[r] < size[smallest[c]]) smallest[c] = r;
+  numbers.clear();
+  for (const std::size_t r : smallest) numbers.push_back(r < regions.size() ? static_cast<PetscScalar>(r + 1) : 0);
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -308,7 +368,7 @@ PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
   const bool gas = scene_.facts().airflow;
   const Assembly &assembly = model_.assembly();
   const TissueLaw &law = scene_.tissue().law();
-  std::vector<PetscScalar> u, p, J, porosity, hydrostatic, von_mises;
+  std::vector<PetscScalar> u, p, J, least_J, ventilation, porosity, hydrostatic, von_mises;
   CellErrors errors;
 
   PetscFunctionBeginUser;
@@ -319,12 +379,13 @@ PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
     PetscCall(append_at(dm, node, displacement, x.data(), u));
     if (gas) PetscCall(append_at(dm, node, pressure, x.data(), p));
   }
+  for (PetscScalar &value : p) value /= units::kPa_per_cmH2O;
   // cell means over the quadrature points
   std::vector<PointState> states;
+  const auto &weights = assembly.relative_weights();
   for (PetscInt c = 0; c < assembly.cells(); ++c) {
     assembly.point_states(c, x.data(), states);
-    PetscScalar mean_J = 0, mean_h = 0, mean_m = 0;
-    const auto &weights = assembly.relative_weights();
+    PetscScalar mean_J = 0, mean_h = 0, mean_m = 0, lowest = states.front().J;
     for (std::size_t q = 0; q < weights.size(); ++q) {
       const PointState &s = states[q];
       PetscScalar P[9], sigma[9];
@@ -337,13 +398,24 @@ PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
       PetscScalar deviator[9];
       for (int i = 0; i < 9; ++i) deviator[i] = sigma[i] - (i % 4 == 0 ? h : 0);
       mean_J += weights[q] * s.J;
+      lowest = std::min(lowest, s.J);
       mean_h += weights[q] * h;
       mean_m += weights[q] * std::sqrt(1.5 * contract(deviator, deviator));
     }
     J.push_back(mean_J);
+    least_J.push_back(lowest);
     hydrostatic.push_back(mean_h);
     von_mises.push_back(mean_m);
     if (gas) porosity.push_back(1 - (1 - scene_.airflow().porosity()) / mean_J);
+  }
+  if (breath_start_) {
+    const ReadArray start(breath_start_);
+    for (PetscInt c = 0; c < assembly.cells(); ++c) {
+      PetscScalar mean = 0;
+      assembly.point_states(c, start.data(), states);
+      for (std::size_t q = 0; q < weights.size(); ++q) mean += weights[q] * states[q].J;
+      ventilation.push_back(J[c] - mean);
+    }
   }
   if (output_.error_indicator()) {
     if (!indicator_) {
@@ -354,22 +426,24 @@ PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
   }
   const std::string name = snapshot_name(count_);
   ValueFile file(comm);
-  PetscCall(file.write("displacement", 3, u));
-  PetscCall(file.write("J", 1, J));
-  PetscCall(file.write("hydrostatic_stress", 1, hydrostatic));
-  PetscCall(file.write("von_mises_stress", 1, von_mises));
+  PetscCall(file.write(displacement_name, 3, u));
+  PetscCall(file.write(mean_J_name, 1, J));
+  PetscCall(file.write(least_J_name, 1, least_J));
+  PetscCall(file.write(hydrostatic_name, 1, hydrostatic));
+  PetscCall(file.write(von_mises_name, 1, von_mises));
+  if (breath_start_) PetscCall(file.write(ventilation_name, 1, ventilation));
   if (gas) {
-    PetscCall(file.write("pressure", 1, p));
-    PetscCall(file.write("porosity", 1, porosity));
+    PetscCall(file.write(pressure_name, 1, p));
+    PetscCall(file.write(porosity_name, 1, porosity));
   }
   if (output_.error_indicator()) {
     PetscMPIInt rank;
     std::vector<PetscScalar> whole;
     PetscCallMPI(MPI_Comm_rank(comm, &rank));
     if (rank == 0) whole = {errors.stress, errors.dissipation};
-    PetscCall(file.write(error_indicator, 1, errors.tissue));
-    if (gas) PetscCall(file.write(error_indicator + "_flux", 1, errors.flow));
-    PetscCall(file.write(error_indicator + "_whole", 1, whole));
+    PetscCall(file.write(tissue_error_name, 1, errors.tissue));
+    if (gas) PetscCall(file.write(flow_error_name, 1, errors.flow));
+    PetscCall(file.write(whole_error_name, 1, whole));
   }
   PetscCall(file.close(output_.path(name)));
   ++count_;
@@ -398,29 +472,30 @@ PetscErrorCode FieldWriter::write_index() const
       << "<Grid Name=\"lung\" GridType=\"Collection\" CollectionType=\"Temporal\">\n";
     f.precision(15);
     for (const Snapshot &s : snapshots_) {
-      const auto attribute = [&](const char *name, const char *centre, PetscInt rows, PetscInt columns) {
+      const auto attribute = [&](const char *name, const char *centre, PetscInt rows, PetscInt columns,
+                                 const std::string &h5) {
         f << "  <Attribute Name=\"" << name << "\" AttributeType=\"" << (columns == 3 ? "Vector" : "Scalar")
           << "\" Center=\"" << centre << "\">";
-        item(s.file.c_str(), name, rows, columns, "Float");
+        item(h5.c_str(), name, rows, columns, "Float");
         f << "</Attribute>\n";
       };
+      const auto of_cells = [&](const char *name) { attribute(name, "Cell", n_cells_, 1, s.file); };
       f << " <Grid Name=\"step\" GridType=\"Uniform\">\n  <Time Value=\"" << s.time
         << "\"/>\n  <Topology TopologyType=\"Tetrahedron_10\" NumberOfElements=\"" << n_cells_ << "\">";
       item(s.mesh.c_str(), "topology", n_cells_, 10, "Int");
       f << "</Topology>\n  <Geometry GeometryType=\"XYZ\">";
       item(s.mesh.c_str(), "geometry", n_nodes_, 3, "Float");
       f << "</Geometry>\n";
-      attribute("displacement", "Node", n_nodes_, 3);
-      attribute("J", "Cell", n_cells_, 1);
-      attribute("hydrostatic_stress", "Cell", n_cells_, 1);
-      attribute("von_mises_stress", "Cell", n_cells_, 1);
+      attribute(displacement_name, "Node", n_nodes_, 3, s.file);
+      for (const char *name : {mean_J_name, least_J_name, hydrostatic_name, von_mises_name}) of_cells(name);
+      attribute(region_name, "Cell", n_cells_, 1, s.mesh);
+      if (scene_.facts().ventilator) of_cells(ventilation_name);
       if (scene_.facts().airflow) {
-        attribute("pressure", "Node", n_nodes_, 1);
-        attribute("porosity", "Cell", n_cells_, 1);
+        attribute(pressure_name, "Node", n_nodes_, 1, s.file);
+        of_cells(porosity_name);
       }
-      if (s.error_indicator) attribute(error_indicator.c_str(), "Cell", n_cells_, 1);
-      if (s.error_indicator && scene_.facts().airflow)
-        attribute((error_indicator + "_flux").c_str(), "Cell", n_cells_, 1);
+      if (s.error_indicator) of_cells(tissue_error_name);
+      if (s.error_indicator && scene_.facts().airflow) of_cells(flow_error_name);
       f << " </Grid>\n";
     }
     f << "</Grid>\n</Domain>\n</Xdmf>\n";

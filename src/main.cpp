@@ -13,6 +13,7 @@
 #include <cstdio>
 #include <cstdlib>
 #include <exception>
+#include <string>
 
 namespace {
 
@@ -73,6 +74,50 @@ int exit_code(PetscErrorCode code, bool finished)
   }
 }
 
+/// Makes what rank 0 has known to all ranks.
+void share(std::string &text)
+{
+  unsigned long size = text.size();
+  MPI_Bcast(&size, 1, MPI_UNSIGNED_LONG, 0, MPI_COMM_WORLD);
+  text.resize(size);
+  MPI_Bcast(text.data(), static_cast<int>(size), MPI_CHAR, 0, MPI_COMM_WORLD);
+}
+
+/// Puts what was given into PETSc's database, which may be done before PETSc starts. @p sources: where each is from.
+PetscErrorCode hand_over(const pulmo::GivenOptions &given, pulmo::OptionList &sources)
+{
+  bool monitor = false;
+
+  for (const pulmo::GivenOption &o : given.list) monitor = monitor || o.name == "-options_monitor";
+  for (const pulmo::GivenOption &o : given.list) {
+    if (o.name == "-options_monitor" || o.name == "-options_monitor_cancel" || o.name == "-skip_petscrc") continue;
+    const PetscErrorCode code =
+        PetscOptionsSetValue(nullptr, o.name.c_str(), o.value.empty() ? nullptr : o.value.c_str());
+    if (code != 0) return code;
+    sources.emplace_back(o.name, o.source);
+  }
+  int rank;
+  MPI_Comm_rank(MPI_COMM_WORLD, &rank);
+  if (monitor && rank == 0)
+    for (const pulmo::GivenOption &o : given.list)
+      std::printf("%s %s (%s)\n", o.name.c_str(), o.value.c_str(), o.source.c_str());
+  return PETSC_SUCCESS;
+}
+
+/// Starts PETSc, which would read again what pulmo has read.
+PetscErrorCode start_petsc(char *program)
+{
+  static char skip[] = "-skip_petscrc"; // PETSc keeps its arguments
+  static char *words[] = {program, skip, nullptr};
+  char **argv = words;
+  int argc = 2;
+
+  unsetenv("PETSC_OPTIONS");
+  unsetenv("PETSC_OPTIONS_YAML");
+  const PetscErrorCode code = PetscInitialize(&argc, &argv, nullptr, "pulmo: whole-lung poromechanics\n");
+  return code == 0 ? PetscOptionsClearValue(nullptr, skip) : code;
+}
+
 } // namespace
 
 int main(int argc, char **argv)
@@ -88,20 +133,27 @@ int main(int argc, char **argv)
   MPI_Errhandler_free(&mpi_errors);
   std::signal(SIGABRT, on_abort);
   MPI_Comm_rank(MPI_COMM_WORLD, &rank);
-  int faulty = 0;
-  if (rank == 0) { // option files may be on its disk alone: PETSc reads them there, too
-    const std::string fault = pulmo::command_line_fault({argv + 1, argv + argc});
-    faulty = !fault.empty();
-    if (faulty) std::fprintf(stderr, "pulmo: error: %s\n", fault.c_str());
-  }
-  MPI_Bcast(&faulty, 1, MPI_INT, 0, MPI_COMM_WORLD);
-  if (faulty) {
+  std::string packed; // read by rank 0: option files may be on its disk alone
+  if (rank == 0) packed = pulmo::read_options({argv + 1, argv + argc}, pulmo::Surroundings::of_process()).packed();
+  share(packed);
+  const pulmo::GivenOptions given = pulmo::GivenOptions::unpacked(packed);
+  if (given.version || !given.fault.empty()) {
+    if (rank == 0 && given.version)
+      std::printf("pulmo %s (PETSc %d.%d.%d)\n", pulmo::version(), PETSC_VERSION_MAJOR, PETSC_VERSION_MINOR,
+                  PETSC_VERSION_SUBMINOR);
+    else if (rank == 0)
+      std::fprintf(stderr, "pulmo: error: %s\n", given.fault.c_str());
     MPI_Finalize();
-    return PULMO_WRONG_INPUT;
+    return given.version ? PULMO_FINISHED : PULMO_WRONG_INPUT;
   }
-  PetscErrorCode code = PetscInitialize(&argc, &argv, nullptr, "pulmo: whole-lung poromechanics\n");
+  pulmo::OptionList sources;
+  PetscErrorCode code = hand_over(given, sources);
+  if (code == 0) code = start_petsc(argv[0]);
   if (code == 0) code = pulmo::initialize();
-  if (code == 0) code = pulmo::run(pulmo::Registry::standard(), finished);
+  for (const std::string &source : given.unasked)
+    if (code == 0)
+      code = PetscPrintf(PETSC_COMM_WORLD, "pulmo: note: options were also read from %s\n", source.c_str());
+  if (code == 0) code = pulmo::run(pulmo::Registry::standard(), finished, sources);
   int ends_with = exit_code(code, finished);
   (void)pulmo::compat::leave_unused_options_to_pulmo();
   if (PetscFinalize() != 0 && ends_with == PULMO_FINISHED) ends_with = PULMO_COULD_NOT_GO_ON;

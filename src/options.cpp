@@ -1,8 +1,11 @@
 #include "pulmo/options.hpp"
 
 #include <algorithm>
+#include <cctype>
 #include <cmath>
+#include <cstdio>
 #include <cstdlib>
+#include <map>
 #include <optional>
 #include <sstream>
 
@@ -50,10 +53,17 @@ std::size_t distance(const std::string &a, const std::string &b)
   return d[a.size()][b.size()];
 }
 
+/// As PETSc compares names of options.
+std::string lower(std::string text)
+{
+  std::transform(text.begin(), text.end(), text.begin(), [](unsigned char c) { return c < 128 ? std::tolower(c) : c; });
+  return text;
+}
+
 /// What the value of a flag says, in any case; empty if it says neither.
 std::optional<bool> truth(std::string value)
 {
-  std::transform(value.begin(), value.end(), value.begin(), [](unsigned char c) { return std::tolower(c); });
+  value = lower(value);
   for (const char *yes : {"", "on", "true", "yes", "1"})
     if (value == yes) return true;
   for (const char *no : {"off", "false", "no", "0"})
@@ -68,6 +78,67 @@ bool turned_off(const OptionList &list, const std::string &name)
   for (const auto &[option, value] : list)
     if (option == "-" + name) off = truth(value) == false;
   return off;
+}
+
+bool begins_with(const std::string &text, const std::string &start)
+{
+  return text.rfind(start, 0) == 0;
+}
+
+/// Options that PETSc reads when it ends.
+bool read_at_end(const std::string &option)
+{
+  static const std::set<std::string> list{
+      "-options_left", "-options_view", "-log_view",    "-log_view_memory", "-log_view_gpu_time", "-log_all",
+      "-log_trace",    "-log_sync",     "-log_exclude", "-malloc_dump",     "-malloc_view",       "-malloc_debug",
+      "-malloc_info",  "-malloc_test",  "-memory_view", "-objects_dump",    "-get_total_flops",   "-citations",
+      "-mpidump",      "-log",          "-log_mpe"};
+  return list.count(option) > 0;
+}
+
+/// Options that a solver reads when it has gone through a phase.
+bool read_after_steps(const std::string &option)
+{
+  return begins_with(option, "-ts_") && option.find("view") != std::string::npos;
+}
+
+/// Options of the blocks displacement and pressure and of their coupling. @p of_one: those that a scene with one field
+/// leaves unused, where the whole matrix takes the preconditioner of the displacement.
+bool is_of_blocks(const std::string &option, bool of_one)
+{
+  static const std::set<std::string> coupling{"type",
+                                              "schur_fact_type",
+                                              "schur_factorization_type",
+                                              "schur_precondition",
+                                              "schur_scale",
+                                              "default",
+                                              "block_size",
+                                              "dm_splits",
+                                              "diag_use_amat",
+                                              "off_diag_use_amat",
+                                              "gkb_tol",
+                                              "gkb_maxit",
+                                              "gkb_delay",
+                                              "gkb_nu",
+                                              "gkb_monitor",
+                                              "detect_coupling",
+                                              "detect_saddle_point"};
+  const std::string own = "-pc_fieldsplit_", pressure = "-fieldsplit_pressure_",
+                    displacement = "-fieldsplit_displacement_";
+  return (begins_with(option, own) && coupling.count(option.substr(own.size())) > 0) || begins_with(option, pressure) ||
+         begins_with(option, of_one ? displacement + "ksp_" : displacement);
+}
+
+/// Options of the levels of a multigrid, which may have a single one.
+bool is_of_levels(const std::string &option)
+{
+  const std::size_t at = option.rfind("mg_levels_");
+  if (at == std::string::npos) return false;
+  const std::string tail = option.substr(at + std::string("mg_levels_").size());
+  static const std::set<std::string> list{
+      "ksp_type",   "ksp_max_it",     "pc_type", "pc_sor_local_forward", "pc_sor_local_symmetric",
+      "pc_sor_its", "esteig_ksp_type"};
+  return list.count(tail) > 0;
 }
 
 } // namespace
@@ -90,7 +161,9 @@ void Options::group(const std::string &name, const std::string &about, bool in_u
 std::string Options::full(const std::string &name) const
 {
   const std::string &group = groups_.back().name;
-  return "-" + group + (group.empty() || name.empty() ? "" : "_") + name;
+  std::string option = "-" + group + (group.empty() || name.empty() ? "" : "_") + name;
+  std::replace(option.begin(), option.end(), ' ', '_'); // of a surface's name
+  return option;
 }
 
 PetscErrorCode Options::given(const std::string &name, bool &is_given) const
@@ -108,15 +181,20 @@ PetscErrorCode Options::find(const std::string &name, const std::string &default
 {
   const std::string option = full(name);
   const Group &group = groups_.back();
-  char buffer[4096] = "";
-  PetscBool set, has;
+  const char *value = nullptr;
+  PetscBool has;
 
   PetscFunctionBeginUser;
+  for (const Declared &d : declared_)
+    PulmoUserCheck(
+        d.group != groups_.size() - 1 || lower(d.name) != lower(option), comm_,
+        "option %s would belong to two surfaces: capital letters do not count in the names of options, and a "
+        "blank counts as _; rename one of the surfaces in gmsh",
+        option.c_str());
   declared_.push_back({option, default_value, unit, range, help, default_value, groups_.size() - 1});
-  PetscCall(PetscOptionsGetString(nullptr, nullptr, option.c_str(), buffer, sizeof(buffer), &set));
-  PetscCall(PetscOptionsHasName(nullptr, nullptr, option.c_str(), &has));
+  PetscCall(PetscOptionsFindPair(nullptr, nullptr, option.c_str(), &value, &has));
   is_given = has && group.in_use; // check_unknown() reports an option of an effect or law that is not in use
-  if (has) raw = buffer;
+  if (has) raw = value ? value : "";
   if (is_given) declared_.back().used = raw;
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -300,7 +378,6 @@ std::string Options::nearest(const std::string &name, std::size_t most) const
 /// The option that @p name, which nothing declared, must be meant for; empty if it may be one of PETSc's.
 std::string Options::misspelt(const std::string &name) const
 {
-  if (name.compare(0, 2, "--") == 0) return name.substr(1);
   // PETSc has thousands of names, some a letter away from one another: only those that make a scene are guarded
   static constexpr const char *essential[] = {"-dm_plex_filename", "-options_file", "-pc_type", "-ts_dt",
                                               "-ts_max_time"};
@@ -312,32 +389,67 @@ std::string Options::misspelt(const std::string &name) const
        std::find(std::begin(essential), std::end(essential), guess) != std::end(essential)))
     return guess;
   const std::string tail = "_" + name.substr(1); // -pip for -ventilator_pip
-  for (const Declared &d : declared_)
-    if (tail.size() > 3 && d.name.size() > tail.size() &&
-        d.name.compare(d.name.size() - tail.size(), tail.size(), tail) == 0)
-      return d.name;
+  for (const bool in_use : {true, false})
+    for (const Declared &d : declared_)
+      if (groups_[d.group].in_use == in_use && tail.size() > 3 && d.name.size() > tail.size() &&
+          d.name.compare(d.name.size() - tail.size(), tail.size(), tail) == 0)
+        return d.name;
   return "";
+}
+
+std::string Options::hint(const std::string &guess) const
+{
+  if (guess.empty()) return "";
+  std::string needs;
+  for (const Declared &d : declared_) {
+    if (d.name != guess) continue;
+    if (groups_[d.group].in_use) return ": did you mean " + guess + "?";
+    needs = groups_[d.group].enabled_by;
+  }
+  return ": did you mean " + guess + (needs.empty() ? "?" : ", which needs " + needs + "?");
 }
 
 PetscErrorCode Options::all_given(OptionList &list) const
 {
-  char *all = nullptr;
+  char *text = nullptr, **left_names, **left_values;
+  std::size_t length = 0;
+  PetscInt n_left;
+  std::map<std::string, std::string> left; // without dash
+  PetscViewer viewer;
 
   PetscFunctionBeginUser;
   list.clear();
-  PetscCall(PetscOptionsGetAll(nullptr, &all));
-  std::istringstream stream(all);
-  PetscCall(PetscFree(all));
-  // the database prints "-name value -name value ..."
-  for (std::string word; stream >> word;) {
-    PetscBool is_name;
-    PetscCall(PetscOptionsValidKey(word.c_str(), &is_name));
-    if (is_name)
-      list.emplace_back(word, "");
-    else if (!list.empty())
-      list.back().second += (list.back().second.empty() ? "" : " ") + word;
+  // PETSc lists names one a line, and values between blanks that may belong to them; it tells the value of a name alone
+  // only by marking the option as used
+  PetscCall(PetscOptionsLeftGet(nullptr, &n_left, &left_names, &left_values));
+  for (PetscInt i = 0; i < n_left; ++i) left[left_names[i]] = left_values[i] ? left_values[i] : "";
+  PetscCall(PetscOptionsLeftRestore(nullptr, &n_left, &left_names, &left_values));
+  std::FILE *memory = open_memstream(&text, &length);
+  PetscCheck(memory, PETSC_COMM_SELF, PETSC_ERR_MEM, "no memory for the list of options");
+  PetscCall(PetscViewerASCIIOpenWithFILE(PETSC_COMM_SELF, memory, &viewer));
+  PetscCall(PetscOptionsView(nullptr, viewer));
+  PetscCall(PetscViewerDestroy(&viewer));
+  std::fclose(memory);
+  std::istringstream lines(std::string(text, length));
+  std::free(text);
+  for (std::string line; std::getline(lines, line);) {
+    if (line.empty() || line[0] != '-') continue; // a heading
+    const std::string name = line.substr(0, line.find(' '));
+    const auto unused = left.find(name.substr(1));
+    const char *value = nullptr;
+    if (unused != left.end())
+      value = unused->second.c_str();
+    else
+      PetscCall(PetscOptionsFindPair(nullptr, nullptr, name.c_str(), &value, nullptr));
+    list.emplace_back(name, value ? value : "");
   }
   PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+std::string Options::source(const std::string &name) const
+{
+  const auto found = std::find_if(sources_.rbegin(), sources_.rend(), [&](const auto &s) { return s.first == name; });
+  return found == sources_.rend() ? "" : found->second;
 }
 
 OptionList Options::own_used() const
@@ -407,32 +519,58 @@ PetscErrorCode Options::check_unknown() const
                         (name.size() == prefix.size() || name[prefix.size()] == '_');
       if (!ours) continue;
       const std::string guess = nearest(name, name.size() / 3 + 1);
-      PulmoUserError(comm_, "unknown option %s%s; pulmo -help lists all", name.c_str(),
-                     guess.empty() ? "" : (": did you mean " + guess + "?").c_str());
+      PulmoUserError(comm_, "unknown option %s%s; pulmo -help lists all", name.c_str(), hint(guess).c_str());
     }
-    const std::string meant = misspelt(name);
-    PulmoUserCheck(meant.empty(), comm_, "unknown option %s: did you mean %s? pulmo -help lists all", name.c_str(),
-                   meant.c_str());
+    const std::string small = lower(name), meant = misspelt(small);
+    PulmoUserCheck(name.compare(0, 2, "--") != 0, comm_, "unknown option %s: options begin with one dash%s",
+                   name.c_str(), hint(nearest(name.substr(1), 0)).c_str());
+    PulmoUserCheck(meant.empty(), comm_, "unknown option %s%s; pulmo -help lists all", name.c_str(),
+                   hint(meant).c_str());
+    // PETSc takes capitals for small letters, what pulmo checks would pass it by
+    PulmoUserCheck(name == small, comm_, "unknown option %s: names of PETSc's options are in small letters, %s",
+                   name.c_str(), small.c_str());
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Options::warn_unused() const
+PetscErrorCode Options::warn_unused(bool two_fields, bool at_end)
 {
+  OptionList given;
   PetscInt n;
   char **names, **values;
+  int idle = 0;
+  std::string pc_type;
 
   PetscFunctionBeginUser;
+  PetscCall(all_given(given));
+  for (const auto &[name, value] : given)
+    if (name == "-pc_type") pc_type = value;
+  const bool splits = two_fields && pc_type == PCFIELDSPLIT;
   PetscCall(PetscOptionsLeftGet(nullptr, &n, &names, &values));
   for (PetscInt i = 0; i < n; ++i) {
-    const std::string name = std::string("-") + names[i], guess = nearest(name, name.size() / 3 + 1);
-    const auto begins = [&](const char *prefix) { return name.rfind(prefix, 0) == 0; };
-    // solver files serve scenes of one and of two fields; -options_left is PETSc's own
-    if (begins("-options_left") || begins("-pc_fieldsplit_") || begins("-fieldsplit_")) continue;
-    PetscCall(PetscPrintf(comm_, "pulmo: warning: option %s was not used%s\n", name.c_str(),
-                          guess.empty() || guess == name ? "" : ("; did you mean " + guess + "?").c_str()));
+    const std::string name = std::string("-") + names[i];
+    if (read_at_end(name) || (!at_end && read_after_steps(name)) || told_.count(name)) continue;
+    told_.insert(name);
+    if (!splits && is_of_blocks(name, pc_type == PCFIELDSPLIT)) {
+      ++idle;
+      continue;
+    }
+    if (is_of_levels(name)) continue;
+    const std::string from = source(name);
+    std::string guess = nearest(name, name.size() / 4 + 1);
+    if (guess == name || std::any_of(given.begin(), given.end(), [&](const auto &o) { return o.first == guess; }))
+      guess = "";
+    PetscCall(PetscPrintf(comm_, "pulmo: warning: option %s%s was not used%s\n", name.c_str(),
+                          from.empty() || from == "command line" ? "" : (" (" + from + ")").c_str(),
+                          hint(guess).c_str()));
   }
   PetscCall(PetscOptionsLeftRestore(nullptr, &n, &names, &values));
+  // solver files serve scenes of one and of two fields
+  if (idle > 0 && pc_type != PCFIELDSPLIT)
+    PetscCall(PetscPrintf(comm_,
+                          "pulmo: note: with -pc_type %s nothing uses the %d options of -pc_fieldsplit and "
+                          "-fieldsplit\n",
+                          pc_type.c_str(), idle));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -1,10 +1,10 @@
 #include "pulmo/programme.hpp"
 
+#include "pulmo/text_file.hpp"
 #include "pulmo/units.hpp"
 
 #include <algorithm>
 #include <cmath>
-#include <fstream>
 #include <sstream>
 
 namespace pulmo {
@@ -105,16 +105,14 @@ struct Line {
   std::vector<std::string> words;
 };
 
-/// Lines without comments and blanks.
+/// Lines of a clean text without comments and blanks.
 std::vector<Line> cut(const std::string &text)
 {
   std::vector<Line> lines;
-  const bool byte_order_mark = text.compare(0, 3, "\xEF\xBB\xBF") == 0;
-  std::istringstream in(text.substr(byte_order_mark ? 3 : 0));
-  std::string raw;
-  for (int number = 1; std::getline(in, raw); ++number) {
+  int number = 0;
+  for (const std::string &raw : lines_of(text)) {
     std::istringstream words(raw.substr(0, raw.find('#')));
-    Line line{number, {}};
+    Line line{++number, {}};
     for (std::string word; words >> word;) line.words.push_back(word);
     if (!line.words.empty()) lines.push_back(line);
   }
@@ -314,8 +312,12 @@ private:
 PetscErrorCode parse_programme(MPI_Comm comm, const std::string &file, const std::string &text,
                                std::vector<Phase> &phases)
 {
+  std::string clean = text;
+
   PetscFunctionBeginUser;
-  PetscCall(Parser(comm, file, text).parse(phases));
+  const std::string fault = clean_text(clean);
+  PulmoUserCheck(fault.empty(), comm, "%s: %s", file.c_str(), fault.c_str());
+  PetscCall(Parser(comm, file, clean).parse(phases));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -329,11 +331,7 @@ PetscErrorCode read_programme(MPI_Comm comm, const std::string &option, const st
   PetscFunctionBeginUser;
   PetscCallMPI(MPI_Comm_rank(comm, &rank));
   if (rank == 0) {
-    std::ifstream in(file, std::ios::binary);
-    text.resize(static_cast<std::size_t>(largest_file) + 1);
-    in.read(text.data(), static_cast<std::streamsize>(text.size()));
-    readable = in.is_open() && !in.bad();
-    text.resize(static_cast<std::size_t>(in.gcount()));
+    readable = read_text(file, static_cast<std::size_t>(largest_file) + 1, text);
   }
   PetscCall(from_root(comm, readable));
   PulmoUserCheck(readable, comm, "cannot read %s (%s); check its name", file.c_str(), option.c_str());

@@ -125,6 +125,24 @@ PetscErrorCode warn_of_equal_order(MPI_Comm comm, const Scene &scene, const Mode
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+/// Tells of options that nothing used as soon as all had their turn: after the first step.
+class UnusedOptions final : public Observer {
+public:
+  UnusedOptions(Options &options, const Scene &scene) : options_(options), scene_(scene) {}
+  PetscErrorCode observe(const StepReport &step) override
+  {
+    PetscFunctionBeginUser;
+    if (!done_ && step.row.dt > 0) PetscCall(options_.warn_unused(scene_.facts().airflow, false));
+    done_ = step.row.dt > 0;
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+private:
+  Options &options_;
+  const Scene &scene_;
+  bool done_ = false;
+};
+
 /// Holds the energy that the steps of a run lost or made against the work that was given.
 PetscErrorCode hold_energy(MPI_Comm comm, const EnergyAudit &energy, Simulation &simulation, bool &finished)
 {
@@ -144,14 +162,13 @@ PetscErrorCode hold_energy(MPI_Comm comm, const EnergyAudit &energy, Simulation 
 
 } // namespace
 
-PetscErrorCode check_held(const Scene &scene, const Model &model)
+PetscErrorCode check_held(MPI_Comm comm, const Scene &scene, const Composition &composition)
 {
-  const Composition &composition = model.composition();
   const std::vector<std::string> walls = composition.surfaces_of("lumen_pressure"),
                                  bearing = composition.bearing_surfaces();
 
   PetscFunctionBeginUser;
-  PetscCall(check_held(PetscObjectComm((PetscObject)model.dm()), composition, model.modulus()));
+  PetscCall(check_held(comm, composition, reference_modulus(scene.tissue().law())));
   if (!walls.empty() && std::find(bearing.begin(), bearing.end(), "") == bearing.end())
     PetscCall(check_wall_load(scene.mesh(), walls, bearing));
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -208,7 +225,12 @@ PetscErrorCode Run::setup()
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode run(const Registry &registry, bool &finished)
+const char *version()
+{
+  return PULMO_VERSION;
+}
+
+PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &sources)
 {
   const MPI_Comm comm = PETSC_COMM_WORLD;
   Run run(registry);
@@ -223,6 +245,7 @@ PetscErrorCode run(const Registry &registry, bool &finished)
 
   PetscFunctionBeginUser;
   finished = false;
+  options.came_from(sources);
   PetscCall(run.declare());
   PetscCall(output.declare(options));
   PetscCall(checkpoint.declare(options));
@@ -241,7 +264,7 @@ PetscErrorCode run(const Registry &registry, bool &finished)
     finished = true;
     PetscFunctionReturn(PETSC_SUCCESS);
   }
-  PetscCall(check_held(scene, run.model()));
+  PetscCall(check_held(comm, scene, run.model().composition()));
   if (!run.settle_note().empty()) PetscCall(PetscPrintf(comm, "pulmo: note: %s\n", run.settle_note().c_str()));
   PetscCall(note_no_breath(comm, scene));
   PetscCall(error_estimate.check(options, scene));
@@ -270,6 +293,8 @@ PetscErrorCode run(const Registry &registry, bool &finished)
     PetscCall(energy.setup());
     simulation.add(energy);
   }
+  UnusedOptions unused(options, scene);
+  simulation.add(unused);
   simulation.add(signals);
   simulation.add(fields);
   if (output.progress()) simulation.add(progress);
@@ -289,7 +314,7 @@ PetscErrorCode run(const Registry &registry, bool &finished)
     PetscCall(signal.asked(asked_to_stop)); // in the last step
   }
   if (finished && audit_energy) PetscCall(hold_energy(comm, energy, simulation, finished));
-  PetscCall(options.warn_unused());
+  PetscCall(options.warn_unused(scene.facts().airflow, true));
   PetscCall(warn_of_no_air(comm, scene, simulation));
   PetscCall(simulation.pins().warn(run.model()));
   for (const SignalRow &row : simulation.rows()) // steps that were cut

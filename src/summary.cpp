@@ -64,7 +64,8 @@ Json regions_json(const RegionAudit &audit, const BreathRows &breath, bool gas)
   for (std::size_t r = 0; r < audit.regions().size(); ++r) {
     const RegionState &s = audit.state(breath.fullest, r);
     const auto pressure_json = [gas](double p) { return gas ? Json(p) : Json(nullptr); };
-    json[audit.regions()[r].name] = {{"connected_body", audit.regions()[r].body},
+    json[audit.regions()[r].name] = {{"number", r + 1},
+                                     {"connected_body", audit.regions()[r].body},
                                      {"reference_volume_ml", audit.volume(r)},
                                      {"ventilation_ml", audit.ventilation(breath, r)},
                                      {"ventilation_share", optional_json(audit.ventilation_share(breath, r))},
@@ -215,6 +216,10 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
     Json list;
     for (const auto &[name, value] : used) list[name] = value;
     json["options"] = list;
+    Json sources = Json::object(); // of what was given
+    for (const auto &[name, value] : used)
+      if (const std::string source = options.source(name); !source.empty()) sources[name] = source;
+    json["option_sources"] = sources;
 
     f << json.dump(2, ' ', false, Json::error_handler_t::replace) << "\n";
   }

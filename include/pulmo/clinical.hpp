@@ -34,10 +34,12 @@ struct SignalRow {
 
 /// Numbers of one breath, or of a whole run. What a breath does not define stays empty. Pressures are the machine's.
 struct ClinicalNumbers {
-  std::optional<double> compliance;         ///< C_rs of the fit, ml/cmH2O
-  std::optional<double> resistance;         ///< R of the fit, cmH2O s/l
-  std::optional<double> time_constant;      ///< R C_rs, s
-  std::optional<double> plateau_pressure;   ///< at the end of inspiration if that is the end of a pause, cmH2O
+  std::optional<double> compliance;              ///< C_rs of the fit, ml/cmH2O
+  std::optional<double> resistance;              ///< R of the fit, cmH2O s/l
+  std::optional<double> time_constant;           ///< R C_rs, s
+  std::optional<double> equal_weight_compliance; ///< of the fit with an intercept, ml/cmH2O
+  std::optional<double> equal_weight_resistance; ///< of the same, cmH2O s/l
+  std::optional<double> plateau_pressure;        ///< at the end of inspiration if that is the end of a pause, cmH2O
   std::optional<double> pause_resistance;   ///< drop of pressure into that pause over the flow before it, cmH2O s/l
   std::optional<double> static_compliance;  ///< V_T / (plateau - total PEEP at the start), ml/cmH2O
   std::optional<double> dynamic_compliance; ///< V_T / (peak - PEEP), ml/cmH2O
@@ -98,6 +100,11 @@ std::vector<StaticPoint> static_points(const std::vector<SignalRow> &rows, std::
 /// resists the flow. @p start: V_start, ml; that of row @p first if not given.
 void fit_single_compartment(const std::vector<SignalRow> &rows, std::size_t first, std::size_t last, double peep,
                             ClinicalNumbers &numbers, std::optional<double> start = {});
+
+/// The fit that most other groups make: P = P_0 + E V + R flow with equal weights for all rows (first, last], and P_0
+/// free. Leaves both empty where the rows do not define them.
+void fit_with_intercept(const std::vector<SignalRow> &rows, std::size_t first, std::size_t last,
+                        ClinicalNumbers &numbers);
 
 /// Numbers over rows first ... last, row @p first being the start of the breath.
 ClinicalNumbers clinical_numbers(const std::vector<SignalRow> &rows, std::size_t first, std::size_t last);

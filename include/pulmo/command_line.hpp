@@ -1,5 +1,7 @@
 /// @file
-/// Looks through the command line and the option files before PETSc does.
+/// Reads options from where PETSc would: .petscrc files, the environment, the command line and the files that these
+/// name. pulmo reads them itself, before PETSc starts, so that each word is either part of an option or an error, and
+/// each option's origin is known.
 #pragma once
 
 #include <string>
@@ -7,9 +9,35 @@
 
 namespace pulmo {
 
-/// What is wrong with the words of a command line or with the files that its -options_file name (and the files that
-/// those name), in a sentence that says how to fix it; empty if nothing is. PETSc answers mistakes in a file with a stack
-/// trace and passes over words that belong to no option. Files in YAML are left to PETSc.
-std::string command_line_fault(const std::vector<std::string> &words);
+/// An option as it was given.
+struct GivenOption {
+  std::string name;   ///< with its dash
+  std::string value;  ///< empty: none
+  std::string source; ///< "command line", the name of a file, or that of a variable of the environment
+};
+
+/// What surrounds the program: where options come from beside its command line.
+struct Surroundings {
+  std::string home;                  ///< folder of a .petscrc; empty: none
+  bool working_directory = false;    ///< .petscrc and petscrc of the working directory are read
+  std::string options, options_yaml; ///< the variables PETSC_OPTIONS and PETSC_OPTIONS_YAML
+
+  static Surroundings of_process();
+};
+
+/// Everything that was given, later ones of a name after earlier ones.
+struct GivenOptions {
+  std::vector<GivenOption> list;
+  std::string fault;                ///< what is wrong, in a sentence that tells how to fix it; empty: nothing
+  std::vector<std::string> unasked; ///< sources that the command line does not name
+  bool version = false;             ///< only the version is asked for
+
+  /// As one string, to be sent to the other ranks, and back.
+  std::string packed() const;
+  static GivenOptions unpacked(const std::string &text);
+};
+
+/// @p words: the command line without the program's name.
+GivenOptions read_options(const std::vector<std::string> &words, const Surroundings &around = {});
 
 } // namespace pulmo

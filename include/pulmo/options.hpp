@@ -6,6 +6,7 @@
 #include "pulmo/petsc.hpp"
 
 #include <limits>
+#include <set>
 #include <string>
 #include <utility>
 #include <vector>
@@ -80,12 +81,17 @@ public:
   /// Names the options given that let a solver pass for done when it is not, and how to fix that: a sentence without
   /// its full stop.
   PetscErrorCode loosened(std::string &text) const;
-  /// Warns of PETSc options that nobody read, with the nearest name that is known.
-  PetscErrorCode warn_unused() const;
+  /// Warns, once each, of PETSc options that nobody read, with the nearest name that is known. @p two_fields: the scene
+  /// has a pressure, so that it may split its matrix. @p at_end: also of those that are read when a run ends.
+  PetscErrorCode warn_unused(bool two_fields, bool at_end);
   /// Prints every declared option (the part of -help that is pulmo's own).
   PetscErrorCode print_help() const;
   /// Prints what the options that were left open came to (settle(), turn_off()).
   PetscErrorCode print_settled() const;
+  /// Where options came from, by name; the last entry of a name counts.
+  void came_from(const OptionList &sources) { sources_ = sources; }
+  /// Where @p name came from: the command line, a file, the environment; empty if nothing tells.
+  std::string source(const std::string &name) const;
   /// Name and value of each option in the database.
   PetscErrorCode all_given(OptionList &list) const;
   /// Name and value of every option that the run used: pulmo's own of what is in use, defaults included, and PETSc's
@@ -122,10 +128,14 @@ private:
   /// than @p most letters.
   std::string nearest(const std::string &name, std::size_t most) const;
   std::string misspelt(const std::string &name) const;
+  /// ": did you mean ...?" with what that option needs in this scene; empty for an empty @p guess.
+  std::string hint(const std::string &guess) const;
 
   MPI_Comm comm_;
   std::vector<Group> groups_;
   std::vector<Declared> declared_;
+  OptionList sources_;
+  std::set<std::string> told_; ///< options of which warn_unused() has warned
 };
 
 } // namespace pulmo

@@ -111,6 +111,9 @@ private:
   PetscErrorCode number_nodes();
   PetscErrorCode write_mesh();
   PetscErrorCode write_index() const;
+  PetscErrorCode follow_breaths(const StepReport &step);
+  /// For each cell of this rank the number of the smallest region that holds it, as in summary.json.
+  PetscErrorCode region_numbers(std::vector<PetscScalar> &numbers) const;
 
   struct Snapshot {
     PetscReal time;         ///< s
@@ -129,6 +132,9 @@ private:
   std::string mesh_ = "fields.h5"; ///< nodes and cells of this session's snapshots
   bool mesh_written_ = false;
   Schedule schedule_;
+  VecHandle breath_start_, phase_end_;        ///< local states, with a ventilator: at the start of the breath at hand,
+                                              ///< and at the end of the last phase
+  int breath_ = 0;                            ///< the breath at hand
   std::unique_ptr<ErrorIndicator> indicator_; ///< made for the first snapshot that wants one
 };
 

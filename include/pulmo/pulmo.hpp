@@ -42,10 +42,14 @@ private:
 PetscErrorCode settle_under_loads(Scene &scene, Model &model, std::string &note);
 
 /// Refuses a lung with a rigid motion that nothing holds, or with a wall load that nothing bears.
-PetscErrorCode check_held(const Scene &scene, const Model &model);
+PetscErrorCode check_held(MPI_Comm comm, const Scene &scene, const Composition &composition);
 
 /// Runs the scene of the options database and writes its output. @p finished tells whether the run reached its
 /// end; errors that a sentence tells come back with the code of their kind, already printed.
-PetscErrorCode run(const Registry &registry, bool &finished);
+/// @p sources: where options are from, by their names (for summary.json).
+PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &sources = {});
+
+/// Of pulmo itself.
+const char *version();
 
 } // namespace pulmo

@@ -15,7 +15,7 @@ ITERATIVE = pulmo.options_file("solvers/iterative.opts")
 def fields(case, step=-1):
     """Of a snapshot: vertices' coordinates and pressures, volume and J of each cell and its middle."""
     x, cells, values = pulmo.fields(case, step)
-    cells, p, J = cells[:, :4], values.get("pressure"), values["J"]
+    cells, p, J = cells[:, :4], values.get("alveolar_pressure_cmH2O"), values["J_mean"]
     a, b, c, d = (x[cells[:, i]] for i in range(4))
     volume = np.abs(np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a)) / 6
     return x, cells, p, volume, J, (a + b + c + d) / 4

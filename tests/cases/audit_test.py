@@ -44,8 +44,8 @@ class Fields:
     """Gradients and values at the points of a rule in every cell, for one snapshot."""
 
     def __init__(self, x, cells, step, rule=4):
-        u = step[1]["displacement"]
-        p = step[1].get("pressure", np.zeros(len(x)))
+        u = step[1]["displacement_mm"]
+        p = step[1].get("alveolar_pressure_cmH2O", np.zeros(len(x))) * pulmo.KPA_PER_CMH2O
         self.weights, self.F, self.p, self.grad_p = [], [], [], []
         for point, weight in tetrahedron_rule(rule):
             g = quadratic_shapes(point)

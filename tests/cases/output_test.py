@@ -105,6 +105,9 @@ def read_fields(case):
             for t, p, c in steps]
 
 
+OF_CELLS = {"J_mean", "J_min", "hydrostatic_stress_kPa", "von_mises_stress_kPa", "region_number"}
+
+
 class Breaths(unittest.TestCase):
     """PEEP, settling, pause, ramps up and down, two breaths; airflow with a permeability that traps some gas."""
 
@@ -272,36 +275,43 @@ class Breaths(unittest.TestCase):
         ends = [0] + [p[3] for p in schedule()]
         np.testing.assert_allclose([t for t, _, _ in steps], ends, atol=1e-9)
         for k, (t, nodal, cellwise) in enumerate(steps):
-            self.assertEqual(set(nodal), {"displacement", "pressure"})
-            self.assertEqual(set(cellwise), {"J", "hydrostatic_stress", "von_mises_stress", "porosity"})
-            self.assertEqual(nodal["displacement"].shape, (len(points), 3))
-            self.assertEqual(nodal["pressure"].shape, (len(points),))
+            self.assertEqual(set(nodal), {"displacement_mm", "alveolar_pressure_cmH2O"})
+            self.assertEqual(set(cellwise), OF_CELLS | {"porosity", "ventilation_since_breath_start"})
+            self.assertEqual(nodal["displacement_mm"].shape, (len(points), 3))
+            self.assertEqual(nodal["alveolar_pressure_cmH2O"].shape, (len(points),))
             for name, values in {**nodal, **cellwise}.items():
                 self.assertTrue(np.isfinite(values).all(), name)
                 if name in cellwise:
                     self.assertEqual(values.shape, (100,), name)
             row = int(np.abs(self.rows["time_s"] - t).argmin())
-            volume, integral, least = jacobians(points, nodal["displacement"], cells)
+            volume, integral, least = jacobians(points, nodal["displacement_mm"], cells)
             self.assertTrue((volume > 0).all(), "VTK's orientation")
             self.assertAlmostEqual(volume.sum(), 1000, places=8)
             self.assertAlmostEqual((integral - volume).sum() / 1000, self.rows["volume_ml"][row], delta=1e-11)
-            np.testing.assert_allclose(cellwise["J"], integral / volume, rtol=1e-11)
+            np.testing.assert_allclose(cellwise["J_mean"], integral / volume, rtol=1e-11)
             np.testing.assert_allclose(cellwise["porosity"], 1 - 0.01 / (integral / volume), rtol=1e-11)
             self.assertGreater(least, 0)
+            self.assertTrue((cellwise["J_min"] <= cellwise["J_mean"] * (1 + 1e-14)).all())
+            self.assertAlmostEqual(cellwise["J_min"].min(), self.rows["min_J"][row], delta=1e-12)
+            # what the cells took in since the breath began is what the signals say
+            begun = max([first for first, _ in self.breaths if first < row], default=0)
+            self.assertAlmostEqual((cellwise["ventilation_since_breath_start"] * volume).sum() / 1000,
+                                   self.rows["volume_ml"][row] - self.rows["volume_ml"][begun], delta=1e-11)
+            self.assertEqual(set(cellwise["region_number"]), {self.summary["regions"]["lung"]["number"]})
             airway = np.abs(points[:, 0] - 10) < 1e-9
             self.assertGreater(airway.sum(), 4)
-            ventilator = self.rows["airway_pressure_cmH2O"][row] * pulmo.KPA_PER_CMH2O
-            np.testing.assert_allclose(nodal["pressure"][airway], ventilator, atol=1e-12, rtol=1e-12)
+            ventilator = self.rows["airway_pressure_cmH2O"][row]
+            np.testing.assert_allclose(nodal["alveolar_pressure_cmH2O"][airway], ventilator, atol=1e-12, rtol=1e-12)
             if k == 0:
-                self.assertEqual(np.abs(nodal["displacement"]).max(), 0)
+                self.assertEqual(np.abs(nodal["displacement_mm"]).max(), 0)
             else:
-                self.assertGreater(np.abs(nodal["displacement"]).max(), 0.1)
-                self.assertGreater(cellwise["von_mises_stress"].min(), 0)
-        self.assertGreater(np.abs(steps[2][1]["pressure"]).min(), 0)
+                self.assertGreater(np.abs(nodal["displacement_mm"]).max(), 0.1)
+                self.assertGreater(cellwise["von_mises_stress_kPa"].min(), 0)
+        self.assertGreater(np.abs(steps[2][1]["alveolar_pressure_cmH2O"]).min(), 0)
 
     def test_pressure_between_the_corners_is_linear(self):
         _, cells, steps = read_fields(self.case)
-        p = steps[2][1]["pressure"]
+        p = steps[2][1]["alveolar_pressure_cmH2O"]
         for node, (a, b) in zip(range(4, 10), ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))):
             np.testing.assert_allclose(p[cells[:, node]], (p[cells[:, a]] + p[cells[:, b]]) / 2, rtol=1e-12)
         self.assertGreater(np.ptp(p), 1e-3)
@@ -361,12 +371,12 @@ class OtherScenes(unittest.TestCase):
         self.assertEqual(case.columns(), COLUMNS)  # the flow of a ventilated scene is the change of volume
         points, cells, steps = read_fields(case)
         for _, nodal, cellwise in steps:
-            self.assertEqual(set(nodal), {"displacement"})
-            self.assertEqual(set(cellwise), {"J", "hydrostatic_stress", "von_mises_stress"})
+            self.assertEqual(set(nodal), {"displacement_mm"})
+            self.assertEqual(set(cellwise), OF_CELLS | {"ventilation_since_breath_start"})
         for name in case.files():
             if name.endswith(".h5"):
                 with h5py.File(case.path(name)) as f:
-                    self.assertFalse({"pressure", "porosity"} & set(f), name)
+                    self.assertFalse({"alveolar_pressure_cmH2O", "porosity"} & set(f), name)
         summary = case.json()
         self.assertNotIn("mass_balance_error_ml", summary)
         self.assertEqual(summary["effects"], ["tissue", "ventilator", "chest_wall"])
@@ -374,7 +384,7 @@ class OtherScenes(unittest.TestCase):
         self.assertNotIn("pressure P1", case.out)
         self.assertNotIn("airflow", case.out)
         rows = case.signals()
-        _, integral, _ = jacobians(points, steps[1][1]["displacement"], cells)
+        _, integral, _ = jacobians(points, steps[1][1]["displacement_mm"], cells)
         peak = int(np.abs(rows["time_s"] - 0.3).argmin())
         self.assertAlmostEqual(integral.sum() / 1000 - 1, rows["volume_ml"][peak], delta=1e-11)
         # without flow through the tissue the volume follows the pressure at once
@@ -402,7 +412,7 @@ class OtherScenes(unittest.TestCase):
         self.assertEqual(case.json()["effects"], ["tissue", "support", "traction"])
         points, _, steps = read_fields(case)
         held = (points[:, 0] < 1e-9) | (np.abs(points[:, 1:] - 5).max(axis=1) > 5 - 1e-9)  # the pleura's five faces
-        u = steps[-1][1]["displacement"]
+        u = steps[-1][1]["displacement_mm"]
         self.assertEqual(np.abs(u[held]).max(), 0)
         self.assertGreater(u[~held][:, 0].max(), 1e-3)
 
@@ -441,7 +451,7 @@ class ErrorIndicator(unittest.TestCase):
     """-output_fields_error_indicator; against true errors: tests/unit/error_indicator_test.cpp, tests/verification/mms."""
 
     SHORT = pulmo.TIGHT + pulmo.PCV + pulmo.CUBE + ["-ts_max_time", "0.2", "-output_fields_error_indicator"]
-    NAMES = ["error_indicator", "error_indicator_flux"]
+    NAMES = ["error_indicator_J", "error_indicator_flux_W"]
 
     def test_any_number_of_ranks(self):
         def by_place(case):
@@ -458,9 +468,9 @@ class ErrorIndicator(unittest.TestCase):
 
     def test_without_airflow(self):
         _, _, steps = read_fields(pulmo.finished(self.SHORT + pulmo.STILL))
-        self.assertEqual(set(steps[0][2]), {"J", "hydrostatic_stress", "von_mises_stress", "error_indicator"})
-        self.assertEqual(np.abs(steps[0][2]["error_indicator"]).max(), 0, "at rest")
-        self.assertGreater(steps[-1][2]["error_indicator"].min(), 0)
+        self.assertEqual(set(steps[0][2]), OF_CELLS | {"ventilation_since_breath_start", "error_indicator_J"})
+        self.assertEqual(np.abs(steps[0][2]["error_indicator_J"]).max(), 0, "at rest")
+        self.assertGreater(steps[-1][2]["error_indicator_J"].min(), 0)
 
     def test_earlier_snapshots_keep_what_they_have(self):
         """The option may come with a restart; fields.xdmf names what each file holds."""
@@ -469,7 +479,7 @@ class ErrorIndicator(unittest.TestCase):
         pulmo.finished(self.SHORT + ["-ts_max_time", "0.3", "-output_fields_every", "0.1", "-restart", case.path("checkpoint.h5"),
                                      "-output_overwrite"], directory=case.directory)
         _, _, steps = read_fields(case)
-        self.assertEqual(["error_indicator" in cellwise for _, _, cellwise in steps], [False, False, False, True])
+        self.assertEqual(["error_indicator_J" in cellwise for _, _, cellwise in steps], [False, False, False, True])
 
     def test_large_at_the_rim_of_the_airway(self):
         case = pulmo.finished(pulmo.options_file("solvers/iterative.opts") + pulmo.PCV + pulmo.LUNG + [

@@ -135,7 +135,7 @@ class Parallel(unittest.TestCase):
             with h5py.File(case.path("fields.h5")) as f:
                 x, cells = f["geometry"][:], f["topology"][:].reshape(-1, 10)
             with h5py.File(case.path("fields_00001.h5")) as f:
-                u, p, J = f["displacement"][:].reshape(-1, 3), f["pressure"][:], f["J"][:]
+                u, p, J = f["displacement_mm"][:].reshape(-1, 3), f["alveolar_pressure_cmH2O"][:], f["J_mean"][:]
             order = np.lexsort(np.round(x, 6).T)
             middles = np.round(x[cells[:, :4]].mean(axis=1), 6)
             cell_order = np.lexsort(middles.T)

@@ -154,7 +154,7 @@ class RestartCase(unittest.TestCase):
         with h5py.File(case.path(re.search(r">([^:>]*):/geometry", text)[1])) as f:
             x = f["geometry"][:]
         with h5py.File(case.path(re.search(r">([^:>]*):/displacement", text)[1])) as f:
-            u = f["displacement"][:].reshape(-1, 3)
+            u = f["displacement_mm"][:].reshape(-1, 3)
         return u[np.lexsort(np.round(x, 6).T)]
 
     def expect_error(self, code, err, *words, ends_with=1):
@@ -340,7 +340,7 @@ class Meshes(RestartCase):
         with h5py.File(reference.path("fields.h5")) as f:
             fissure = f["geometry"][:][:, 0] == 0
         with h5py.File(reference.path("fields_00003.h5")) as f: # at 0.6 s
-            u = f["displacement"][:].reshape(-1, 3)[fissure, 0]
+            u = f["displacement_mm"][:].reshape(-1, 3)[fissure, 0]
         self.assertGreater(u.max(), 0.1)
         self.assertLess(u.min(), -0.1, "the sides of the fissure move differently")
         self.expect_same(reference, other, OTHER_RANKS, after=0.45)

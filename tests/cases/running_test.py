@@ -1,6 +1,7 @@
 #!/usr/bin/python3
-"""What surrounds a run (docs/running.md): the exit code."""
+"""What surrounds a run (docs/running.md): where options come from, the exit code."""
 import os
+import re
 import signal
 import subprocess
 import time
@@ -95,6 +96,215 @@ class ExitCodes(unittest.TestCase):
     def test_help_tells_them(self):
         case = pulmo.finished(["-help"])
         self.assertIn("0 finished, 1 wrong input, 2 could not go on, 3 stopped by a signal", case.out)
+
+
+class Sources(unittest.TestCase):
+    """Options from files, the environment, .petscrc and YAML are read like those of the command line."""
+
+    @classmethod
+    def setUpClass(cls):
+        cls.home = pulmo.scratch("home")
+        cls.work = pulmo.scratch("work")
+        os.mkdir(cls.home)
+        os.mkdir(cls.work)
+
+    def file(self, content, name="some.opts"):
+        path = pulmo.scratch(name)
+        with open(path, "wb") as f:
+            f.write(content if isinstance(content, bytes) else content.encode())
+        return path
+
+    def run_with(self, options, ranks=1, **environment):
+        """A run in an empty folder and home."""
+        kept = dict(pulmo.ENVIRONMENT)
+        pulmo.ENVIRONMENT.update(HOME=self.home, **environment)
+        try:
+            return pulmo.Case(GOOD + SHORT + options, ranks=ranks, cwd=self.work)
+        finally:
+            pulmo.ENVIRONMENT.clear()
+            pulmo.ENVIRONMENT.update(kept)
+
+    def expect(self, case, **used):
+        self.assertEqual(case.code, 0, case.tail())
+        options = case.json()["options"]
+        for name, value in used.items():
+            self.assertEqual(options["-" + name], value)
+        return case.json()["option_sources"]
+
+    def refused(self, case, *words):
+        self.assertEqual(case.code, 1, case.tail())
+        self.assertEqual(case.err.count("pulmo: error:"), 1, case.tail())
+        self.assertEqual(len(case.err.strip().splitlines()), 1, case.tail())
+        for word in words:
+            self.assertIn(word, case.err)
+        self.assertFalse(os.path.exists(case.directory))
+
+    def test_line_ends_and_byte_order_marks(self):
+        for end in "\r", "\n", "\r\n":
+            text = f"# my patient{end}-ventilator_pip 3{end}-ventilator_peep 1{end}"
+            for mark in b"", b"\xef\xbb\xbf":
+                with self.subTest(end=end, mark=mark):
+                    path = self.file(mark + text.encode())
+                    sources = self.expect(self.run_with(["-options_file", path]), ventilator_pip="3", ventilator_peep="1")
+                    self.assertEqual(sources["-ventilator_pip"], path)
+                    self.assertEqual(sources["-airflow_surfaces"], "command line")
+        self.refused(self.run_with(["-options_file", self.file("-ventilator_pip 3\n".encode("utf-16"))]), "some.opts", "UTF-16")
+        self.refused(self.run_with(["-options_file", self.file("-ventilator_pip 3\n".encode("utf-16-le"))]), "line 1", "UTF-16")
+        self.refused(self.run_with(["-options_file", self.file("-ventilator_pip\u00a03\n")]), "no-break space")
+
+    def test_values_with_blanks_and_dashes(self):
+        for name in "pcv -peep", "-x y", "run#3", "l'air", "Lunge \u00fc", "trailing/":
+            with self.subTest(name):
+                folder = os.path.join(pulmo.scratch("of"), name)
+                os.mkdir(os.path.dirname(folder))
+                os.chdir(os.path.dirname(folder))
+                case = pulmo.Case(GOOD + SHORT + ["-checkpoint_every", "0.05", "-output_dir", folder], directory="-")
+                self.assertEqual(case.code, 0, case.tail())
+                case.directory = folder
+                self.assertEqual(case.json()["options"]["-output_dir"], folder)
+                again = pulmo.Case(GOOD + ["-ts_max_time", "0.15", "-output_overwrite", "-restart", folder + "/checkpoint.h5"] +
+                                   ["-output_dir", folder], directory="-")
+                self.assertEqual(again.code, 0, again.tail())
+        # in a file, relative to the working directory
+        case = self.run_with(["-options_file", self.file('-output_overwrite # "no"\n-output_dir "-a \'b"  # "x"\n')] +
+                             ["-output_dir", pulmo.scratch()])
+        self.assertEqual(case.code, 0, case.tail())
+        path = self.file('-output_dir "-a \'b"  # "x"\n')
+        case = pulmo.Case(GOOD + SHORT + ["-options_file", path], directory="-", cwd=self.work)
+        self.assertEqual(case.code, 0, case.tail())
+        self.assertIn("summary.json", os.listdir(os.path.join(self.work, "-a 'b")))
+        case = pulmo.Case(GOOD + SHORT + ["-output_dir", "-x"], directory="-", cwd=self.work)
+        self.assertEqual(case.code, 1)
+        self.refused(self.run_with(["-options_file", self.file('-tissue "ma"x\n')]), "line 1", "closing quote")
+
+    def test_long_folders(self):
+        """Longer than what Open MPI 4.1 bears of a file that ranks write together."""
+        for length in 230, 600:
+            for ranks in 1, 2:
+                with self.subTest(length, ranks=ranks):
+                    folder = pulmo.scratch("x")
+                    while len(folder) < length:
+                        folder += "/" + "y" * min(200, length - len(folder))
+                    case = pulmo.Case(GOOD + SHORT + ["-output_dir", folder, "-checkpoint_every", "0.1"], directory="-",
+                                      ranks=ranks)
+                    self.assertEqual(case.code, 0, case.tail())
+                    for name in "summary.json", "fields_00001.h5", "checkpoint.h5":
+                        self.assertIn(name, os.listdir(folder))
+
+    def test_surfaces_with_blanks(self):
+        with open(pulmo.mesh("cube_lung.msh"), "rb") as f:
+            path = self.file(f.read().replace(b'"airway"', b'"left airway"'), "blank.msh")
+        plain = pulmo.finished(GOOD + SHORT + ["-chest_wall_stiffness_airway", "0.3"])
+        named = ["-dm_plex_filename", path, "-airflow_surfaces", "left airway", "-chest_wall_surfaces", "pleura,left airway"]
+        for given in (named + ["-chest_wall_stiffness_left_airway", "0.3"],
+                      ["-options_file", self.file(f'-dm_plex_filename {path}\n-airflow_surfaces "left airway"\n'
+                                                  "-chest_wall_surfaces 'pleura,left airway'\n"
+                                                  "-chest_wall_stiffness_left_airway 0.3\n")]):
+            case = pulmo.finished(GOOD + SHORT + given)
+            self.assertEqual(case.signals()["volume_ml"][-1], plain.signals()["volume_ml"][-1])
+        self.refused(self.run_with(named + ["-chest_wall_stiffness_left airway", "0.3"]), "holds a blank", "as _")
+        self.refused(self.run_with(["-chest_wall_surfaces", "pleura,Pleura"]), "rename one of the surfaces")
+
+    def test_environment_and_petscrc(self):
+        rc = os.path.join(self.home, ".petscrc")
+        here = os.path.join(self.work, ".petscrc")
+        try:
+            with open(rc, "w") as f:
+                f.write("-ventilator_pip 4\r-ventilator_peep 2\r")
+            with open(here, "w") as f:
+                f.write("-ventilator_peep 1\n")
+            # scene files of the command line come last: only what they leave alone counts
+            for ranks in 1, 2:
+                case = self.run_with(["-options_string_yaml", "ventilator_pause: 0.1"], ranks=ranks,
+                                     PETSC_OPTIONS="-ventilator_ramp_down 0.05 -tissue 'ma'",
+                                     PETSC_OPTIONS_YAML="ventilator: {breaths: 2}")
+                sources = self.expect(case, ventilator_peep="1", ventilator_ramp_down="0.05", ventilator_pause="0.1",
+                                      ventilator_breaths="2", tissue="birzle", ventilator_pip="6")
+                self.assertEqual(sources["-ventilator_peep"], ".petscrc")
+                self.assertEqual(sources["-ventilator_ramp_down"], "PETSC_OPTIONS")
+                self.assertEqual(sources["-ventilator_breaths"], "PETSC_OPTIONS_YAML")
+                self.assertTrue(sources["-ventilator_pip"].endswith("pcv.opts"))
+                for source in rc, ".petscrc", "PETSC_OPTIONS", "PETSC_OPTIONS_YAML":
+                    self.assertEqual(case.out.count(f"pulmo: note: options were also read from {source}\n"), 1, case.out)
+            sources = self.expect(self.run_with(["-skip_petscrc"]), ventilator_peep="0")
+            self.assertNotIn("-skip_petscrc", sources)
+            with open(rc, "w") as f:
+                f.write("-ventilator_pip 4 stray\n")
+            self.refused(self.run_with([]), ".petscrc: line 1", "stray")
+        finally:
+            os.remove(rc)
+            os.remove(here)
+        for text, words in (("stray -ts_dt 0.1", ["'stray'", "PETSC_OPTIONS"]), ("-tissue 'ma", ["PETSC_OPTIONS", "quote"]),
+                            ("-ventilator_pipp 3", ["-ventilator_pip"]), ("-options_file none.opts", ["none.opts", "cannot be read"])):
+            with self.subTest(text):
+                self.refused(self.run_with([], PETSC_OPTIONS=text), *words)
+
+    def test_yaml(self):
+        path = self.file("\ufeffventilator:\r  pip: 3\r  peep: 1\rchest_wall_surfaces: [pleura, airway]\rlumen_pressure:\r", "a.yaml")
+        sources = self.expect(self.run_with(["-options_file", path]), ventilator_pip="3", ventilator_peep="1",
+                              chest_wall_surfaces="pleura,airway", lumen_pressure="")
+        self.assertEqual(sources["-ventilator_pip"], path)
+        for text in "a: [b", "- x", "just words", "\tx: 1\n y: 2":
+            for option, given in (("-options_file", self.file(text, "b.yaml")), ("-options_file_yaml", self.file(text)),
+                                  ("-options_string_yaml", text)):
+                with self.subTest(text, option=option):
+                    self.refused(self.run_with([option, given]), option, "YAML")
+        self.refused(self.run_with(["-options_string", "-ventilator_pip 3"]), "-options_string")
+        self.refused(self.run_with([], PETSC_OPTIONS_YAML="- a"), "PETSC_OPTIONS_YAML")
+
+    def test_nested_files_prefixes_and_aliases(self):
+        inner = self.file("-ventilator_peep 1\n", "inner.opts")
+        outer = self.file(f"alias -push -ventilator_pip\n-options_file {inner}\n-push 3\n", "outer.opts")
+        sources = self.expect(self.run_with(["-options_file", outer, "-prefix_push", "ventilator_", "-pause", "0.1", "-prefix_pop"]),
+                              ventilator_pip="3", ventilator_peep="1", ventilator_pause="0.1")
+        self.assertEqual(sources["-ventilator_peep"], inner)
+        self.assertEqual(sources["-ventilator_pip"], outer)
+        self.refused(self.run_with(["-prefix_push", "x_"]), "-prefix_pop")
+        self.refused(self.run_with(["-prefix_pop"]), "-prefix_push")
+        self.refused(self.run_with(["-help", "me"]), "-help", "'me'")
+
+    def test_words_with_other_dashes_and_capitals(self):
+        self.refused(self.run_with(["\u2013ts_dt", "0.1"]), "an en dash")
+        self.refused(self.run_with(["-TS_dt", "0.1"]), "-TS_dt", "small letters")
+
+    def test_what_nothing_used_is_told_after_the_first_step(self):
+        for solver in "iterative", "iterative_hypre", "iterative_ml", "reuse":
+            if not os.path.exists(os.path.join(pulmo.SOURCE, "petsc_options/solvers", solver + ".opts")):
+                continue
+            for extra in [], pulmo.STILL, ["-elements", "P1-P1"]:
+                with self.subTest(solver, extra=extra):
+                    case = pulmo.finished(GOOD + SHORT + pulmo.options_file(f"solvers/{solver}.opts") + extra)
+                    self.assertNotIn("not used", case.out)
+        slips = ["-fieldsplit_presure_pc_type", "hypre", "-pc_fieldsplit_shur_fact_type", "lower", "-snes_mx_it", "4",
+                 "-fieldsplit_displacement_ksp_tpye", "preonly"]
+        for extra, told in ([], slips[::2]), (pulmo.STILL, slips[:-2:2]):
+            case = pulmo.finished(GOOD + pulmo.options_file("solvers/iterative.opts") + slips + extra +
+                                  ["-progress", "on", "-ts_max_time", "0.2"])
+            warned = re.findall(r"^pulmo: warning: option (\S+) was not used", case.out, re.M)
+            self.assertEqual(sorted(warned), sorted(told), case.out)
+            self.assertLess(case.out.index("was not used"), case.out.index("   0.1000 "), "after the first step")
+        case = pulmo.finished(GOOD + SHORT + pulmo.options_file("solvers/iterative.opts") + ["-pc_type", "lu"])
+        self.assertEqual(case.out.count("nothing uses the"), 1, case.out)
+        self.assertEqual(case.out.count("not used"), 0, case.out)
+
+    def test_the_other_mesh_is_tried_before_the_run(self):
+        with open(pulmo.mesh("cube_lung.msh"), "rb") as f:
+            renamed = self.file(f.read().replace(b'"airway"', b'"mouth"'), "mouth.msh")
+        estimate = ["-error_estimate", "-error_estimate_mesh"]
+        self.refused(self.run_with(estimate + [renamed]), "mouth.msh", "'airway'")
+        self.refused(self.run_with(estimate + [pulmo.mesh("lung_test.msh")]), "another lung")
+        self.refused(self.run_with(estimate + [pulmo.mesh("cube_lung.msh")]), "times as large")
+
+    def test_versions_and_help(self):
+        for flag in "-version", "--version":
+            case = pulmo.Case([flag], directory="-", cwd=self.work)
+            self.assertEqual(case.code, 0, case.tail())
+            self.assertRegex(case.out, r"^pulmo \d+\.\d+\S* \(PETSc \d+\.\d+\.\d+\)\n$")
+        for flag in "-help", "--help", "-h", "-?":
+            case = pulmo.Case([flag], directory="-", cwd=self.work)
+            self.assertEqual(case.code, 0, case.tail())
+            self.assertIn("-ventilator_pip ", case.out)
+        self.assertNotIn("results", os.listdir(self.work))
 
 
 if __name__ == "__main__":

@@ -115,7 +115,7 @@ class Tools(unittest.TestCase):
         x, cells, _ = pulmo.fields(adapted)
         nearest = np.linalg.norm(centres[:, None] - x[cells[:, :4]].mean(axis=1), axis=2).argmin(axis=1)
         change = tet_volumes(x, cells)[nearest] / volume
-        error = values["error_indicator_flux"] / volume
+        error = values["error_indicator_flux_W"] / volume
         self.assertLess(np.median(change[error > np.quantile(error, 0.9)]), 0.8)
         self.assertGreater(np.median(change[error < np.quantile(error, 0.5)]), 1)
 
@@ -165,6 +165,21 @@ class Tools(unittest.TestCase):
         drawn = tool("report", pulmo.scratch())
         self.assertNotEqual(drawn.returncode, 0)
         self.assertNotIn("Traceback", drawn.stderr)
+
+    def test_report_draws_what_a_run_that_failed_or_is_at_work_left(self):
+        failed = pulmo.Case(pulmo.DIRECT + pulmo.CUBE + ["-airflow", "-chest_wall", "-snes_max_it", "1", "-ts_dt", "0.1"] +
+                            pulmo.programme("rest 0.2 pressure 0\npush 0.2 pressure 5\n"))
+        self.assertEqual(failed.code, 2, failed.tail())
+        drawn = tool("report", failed.directory)
+        self.assertEqual(drawn.returncode, 0, drawn.stderr)
+        self.assertIn("report: FAILED: no step could be accepted", drawn.stdout)
+        self.assertIn("waveforms.png", failed.files())
+        os.remove(failed.path("failure.json"))
+        with open(failed.path("signals.csv.part"), "a") as f:
+            f.write("0.3,1.5")  # a row at the moment of its writing
+        drawn = tool("report", failed.directory)
+        self.assertEqual(drawn.returncode, 0, drawn.stderr)
+        self.assertIn("report: NOT FINISHED: at work, stopped or killed; rows up to 0.2 s", drawn.stdout)
 
     def test_benchmark_compares_integrators(self):
         """Both integrators give the same residual and Jacobian; only then are times worth comparing."""

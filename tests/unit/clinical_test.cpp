@@ -67,6 +67,49 @@ TEST(Fit, RecoversElastanceAndResistance)
     }
 }
 
+/// Against Cramer's rule on the normal equations of [E, R, P_0], each row counted once.
+TEST(Fit, WithInterceptCountsEveryRowOnce)
+{
+  auto rows = compartment(0.0125, 0.0042, 5, 2, 300, 7);
+  ClinicalNumbers exact;
+  for (SignalRow &r : rows) r.pressure += 1.5; // not at PEEP where the breath starts
+  fit_with_intercept(rows, 0, rows.size() - 1, exact);
+  ASSERT_TRUE(exact.equal_weight_compliance && exact.equal_weight_resistance);
+  EXPECT_NEAR(*exact.equal_weight_compliance, 80, 80 * 1e-9);
+  EXPECT_NEAR(*exact.equal_weight_resistance, 4.2, 4.2 * 1e-9);
+
+  double A[3][3] = {}, b[3] = {};
+  for (std::size_t i = 1; i < rows.size(); ++i) {
+    SignalRow &r = rows[i];
+    r.pressure += 0.3 * std::sin(3.0 * static_cast<double>(i)) + 1e-5 * r.volume * r.volume; // no compartment
+    const double x[3] = {r.volume, r.flow, 1};
+    for (int j = 0; j < 3; ++j) {
+      b[j] += x[j] * r.pressure;
+      for (int k = 0; k < 3; ++k) A[j][k] += x[j] * x[k];
+    }
+  }
+  const auto determinant = [](const double M[3][3]) {
+    return M[0][0] * (M[1][1] * M[2][2] - M[1][2] * M[2][1]) - M[0][1] * (M[1][0] * M[2][2] - M[1][2] * M[2][0]) +
+           M[0][2] * (M[1][0] * M[2][1] - M[1][1] * M[2][0]);
+  };
+  const auto unknown = [&](int column) {
+    double M[3][3];
+    for (int j = 0; j < 3; ++j)
+      for (int k = 0; k < 3; ++k) M[j][k] = k == column ? b[j] : A[j][k];
+    return determinant(M) / determinant(A);
+  };
+  const ClinicalNumbers n = overall_numbers(rows);
+  ASSERT_TRUE(n.equal_weight_compliance && n.compliance);
+  EXPECT_NEAR(*n.equal_weight_compliance, 1 / unknown(0), 1e-6 / unknown(0));
+  EXPECT_NEAR(*n.equal_weight_resistance, 1000 * unknown(1), 1e-6 * 1000 * unknown(1));
+  EXPECT_GT(std::abs(*n.equal_weight_compliance / *n.compliance - 1), 0.01)
+      << "the other fit weighs by dt, without intercept";
+  for (SignalRow &r : rows) r.flow = 0;
+  ClinicalNumbers none;
+  fit_with_intercept(rows, 0, rows.size() - 1, none);
+  EXPECT_FALSE(none.equal_weight_compliance || none.equal_weight_resistance);
+}
+
 TEST(Fit, LeavesOutTheRowThatABreathStartsFrom)
 {
   // MODEL.md, DESIGN.md: "per breath over its rows"; the start row belongs to the phase before it

@@ -82,7 +82,7 @@ TEST_P(ElementPairs, FieldsAtVerticesAndMiddles)
   VecHandle geometry, displacements, pressures;
   PetscInt n;
   PULMO_OK(load("fields.h5", "geometry", geometry));
-  PULMO_OK(load("fields_00000.h5", "displacement", displacements));
+  PULMO_OK(load("fields_00000.h5", "displacement_mm", displacements));
   PULMO_OK(load("fields_00000.h5", "pressure", pressures));
   PULMO_OK(VecGetSize(pressures, &n));
   EXPECT_GT(n, 14) << "more nodes than vertices";

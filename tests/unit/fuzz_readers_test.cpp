@@ -6,9 +6,12 @@
 #include "pulmo/msh.hpp"
 #include "pulmo/programme.hpp"
 
+#include <algorithm>
+#include <cctype>
 #include <cstdio>
 #include <filesystem>
 #include <fstream>
+#include <map>
 #include <random>
 #include <sstream>
 #include <unistd.h>
@@ -243,7 +246,7 @@ TEST(Fuzz, MeshesOfRandomBytes)
   }
 }
 
-/// PETSc takes whatever passes the look at option files.
+/// Whatever is taken from option files PETSc takes, too, and the list of options gives it back as it was read.
 TEST(Fuzz, OptionFiles)
 {
   const Scratch scratch(".opts");
@@ -252,26 +255,90 @@ TEST(Fuzz, OptionFiles)
   const int n = rounds(600);
   for (const char *file : {"petsc_options/scenes/pcv.opts", "petsc_options/solvers/iterative.opts"}) {
     const std::string seed =
-        content_of(source(file)) + "-airflow_surfaces \"airway rim\"\n\talias -short -long_name # new\n";
+        content_of(source(file)) +
+        "-airflow_surfaces \"airway rim\"\n\talias -short -long_name # new\n-short -7\r-b 'x -y'\n";
     for (int i = 0; i < n; ++i) {
       const std::string text = mutation.of(seed);
       const std::string &path = scratch.write(text);
-      const std::string fault = command_line_fault({"-options_file", path});
-      if (!fault.empty()) {
-        EXPECT_NE(fault.find(path), std::string::npos) << fault;
+      const GivenOptions given = read_options({"-options_file", path});
+      if (!given.fault.empty()) {
+        EXPECT_NE(given.fault.find(path), std::string::npos) << given.fault << "\n" << text;
         continue;
       }
       ++passed;
-      PetscOptions options;
-      PULMO_OK(PetscOptionsCreate(&options));
-      EXPECT_TRUE(
-          taken([&] { return PetscOptionsInsertFile(PETSC_COMM_WORLD, options, path.c_str(), PETSC_TRUE); }, text))
-          << text;
-      PULMO_OK(PetscOptionsDestroy(&options));
+      std::map<std::string, std::string> last;
+      PULMO_OK(PetscOptionsClear(nullptr));
+      for (const GivenOption &o : given.list) {
+        PULMO_OK(PetscOptionsSetValue(nullptr, o.name.c_str(), o.value.empty() ? nullptr : o.value.c_str()));
+        std::string key = o.name;
+        std::transform(key.begin(), key.end(), key.begin(),
+                       [](unsigned char c) { return c < 128 ? std::tolower(c) : c; });
+        last[key] = o.value;
+      }
+      OptionList list;
+      PULMO_OK(Options(PETSC_COMM_WORLD).all_given(list));
+      EXPECT_EQ(list.size(), last.size()) << text;
+      for (const auto &[name, value] : list) {
+        std::string key = name;
+        std::transform(key.begin(), key.end(), key.begin(),
+                       [](unsigned char c) { return c < 128 ? std::tolower(c) : c; });
+        EXPECT_EQ(value, last[key]) << name << " of\n" << text;
+      }
+      const GivenOptions sent = GivenOptions::unpacked(given.packed());
+      ASSERT_EQ(sent.list.size(), given.list.size());
+      for (std::size_t k = 0; k < sent.list.size(); ++k) EXPECT_EQ(sent.list[k].value, given.list[k].value);
     }
   }
+  PULMO_OK(PetscOptionsClear(nullptr));
   EXPECT_GT(passed, n / 10);
   EXPECT_LT(passed, 2 * n - n / 10);
+}
+
+TEST(OptionFiles, LineEndsOfAnySystemAndAByteOrderMark)
+{
+  const Scratch scratch(".opts");
+  for (const std::string end : {"\n", "\r\n", "\r"}) {
+    const std::string &path =
+        scratch.write("\xEF\xBB\xBF-first 1" + end + "# a comment" + end + "-second 'two words'" + end + end +
+                      "-third run#3 # more" + end + "-fourth -2e-3" + end + "-fifth \"-x y\"");
+    const GivenOptions given = read_options({"-options_file", path, "-sixth"});
+    ASSERT_EQ(given.fault, "");
+    ASSERT_EQ(given.list.size(), 6u);
+    const std::vector<std::pair<std::string, std::string>> expected{{"-first", "1"},     {"-second", "two words"},
+                                                                    {"-third", "run#3"}, {"-fourth", "-2e-3"},
+                                                                    {"-fifth", "-x y"},  {"-sixth", ""}};
+    for (std::size_t i = 0; i < 6; ++i) {
+      EXPECT_EQ(given.list[i].name, expected[i].first);
+      EXPECT_EQ(given.list[i].value, expected[i].second);
+      EXPECT_EQ(given.list[i].source, i < 5 ? path : "command line");
+    }
+  }
+}
+
+TEST(OptionFiles, ProgrammesHaveTheSameLineEnds)
+{
+  std::vector<Phase> reference, phases;
+  PULMO_OK(parse_programme(PETSC_COMM_WORLD, "file", "# rise\ninspiration 1 pressure 9 ramp 0.1\nrest 2 pressure 1\n",
+                           reference));
+  for (const char *text : {"\xEF\xBB\xBF# rise\rinspiration 1 pressure 9 ramp 0.1\rrest 2 pressure 1\r",
+                           "# rise\r\ninspiration 1 pressure 9 ramp 0.1\r\nrest 2 pressure 1\r\n"}) {
+    PULMO_OK(parse_programme(PETSC_COMM_WORLD, "file", text, phases));
+    ASSERT_EQ(phases.size(), reference.size()) << text;
+    for (std::size_t i = 0; i < phases.size(); ++i) {
+      EXPECT_EQ(phases[i].name, reference[i].name);
+      EXPECT_EQ(phases[i].end, reference[i].end);
+      EXPECT_EQ(phases[i].to, reference[i].to);
+    }
+  }
+  EXPECT_FALSE(taken(
+      [&] {
+        return parse_programme(PETSC_COMM_WORLD, "file",
+                               std::string("\xFF\xFE"
+                                           "a\0",
+                                           4),
+                               phases);
+      },
+      "UTF-16"));
 }
 
 } // namespace

@@ -310,6 +310,37 @@ TEST(SceneOptions, WhatPetscRenamedGoesByBothNames)
   EXPECT_HAS(text, "options -ts_dt and -ts_time_step are two names of the same");
 }
 
+TEST(SceneOptions, TheListOfGivenOptionsKeepsBlanksAndDashes)
+{
+  PULMO_OK(PetscOptionsClear(nullptr));
+  PULMO_OK(PetscOptionsSetValue(nullptr, "-output_dir", "pcv -peep 5"));
+  PULMO_OK(PetscOptionsSetValue(nullptr, "-peep", "a"));
+  PULMO_OK(PetscOptionsSetValue(nullptr, "-flag", nullptr));
+  PetscBool used; // values of what was read, and of what was not
+  PULMO_OK(PetscOptionsHasName(nullptr, nullptr, "-output_dir", &used));
+  for (int again = 0; again < 2; ++again) {
+    OptionList list;
+    PULMO_OK(Options(PETSC_COMM_WORLD).all_given(list));
+    const std::map<std::string, std::string> given(list.begin(), list.end());
+    const std::map<std::string, std::string> expected{{"-output_dir", "pcv -peep 5"}, {"-peep", "a"}, {"-flag", ""}};
+    EXPECT_EQ(given, expected);
+  }
+  PULMO_OK(PetscOptionsUsed(nullptr, "-flag", &used));
+  EXPECT_FALSE(used) << "the list reads nothing";
+}
+
+TEST(SceneOptions, HintsNameOptionsThatServe)
+{
+  const std::string bare = scene_error("-ventilator_pipp 4");
+  EXPECT_HAS(bare, "did you mean -ventilator_pip, which needs -ventilator pcv?");
+  EXPECT_HAS(scene_error("-ventilator pcv -ventilator_pipp 4"), "did you mean -ventilator_pip?");
+  const std::string dashes = scene_error("--lemon 3");
+  EXPECT_HAS(dashes, "options begin with one dash");
+  EXPECT_EQ(dashes.find("did you mean"), std::string::npos) << dashes;
+  EXPECT_HAS(scene_error("--tissue birzle"), "did you mean -tissue?");
+  EXPECT_HAS(scene_error("-TS_dt 0.1"), "in small letters, -ts_dt");
+}
+
 TEST(SceneOptions, TheListOfGivenOptionsKeepsNegativeNumbers)
 {
   std::vector<std::pair<std::string, std::string>> list;

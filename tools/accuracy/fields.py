@@ -17,6 +17,8 @@ EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))  # of the nodes 4 to 9,
 INSIDE = -1e-9   # barycentric coordinates from here on are inside
 CHUNK = 200_000  # points that are worked on at a time
 NEAREST = (8, 64)  # centroids that are looked at, and for the points that are in none of these
+GAS = "alveolar_pressure_cmH2O"
+KPA_PER_CMH2O = 0.0980665
 SAME = 1e-4        # s: snapshots that are further apart are of different times; fields.xdmf has six digits
 
 
@@ -44,7 +46,8 @@ def read(folder, time):
     with h5py.File(mesh) as file:
         points, cells = file["geometry"][:], file["topology"][:].reshape(-1, 10)
     with h5py.File(values) as file:
-        return Fields(points, cells, file["displacement"][:].reshape(-1, 3), file["pressure"][:].ravel() if "pressure" in file else None)
+        return Fields(points, cells, file["displacement_mm"][:].reshape(-1, 3),
+                      file[GAS][:].ravel() * KPA_PER_CMH2O if GAS in file else None)
 
 
 def rule(n=3):

@@ -55,7 +55,7 @@ def pressures(run):
     x, cells, values = pulmo.fields(run)
     corners = cells[:, :4]
     vertices = np.unique(corners)
-    return x, values["pressure"] / LOAD, corners, vertices
+    return x, values["alveolar_pressure_cmH2O"] * pulmo.KPA_PER_CMH2O / LOAD, corners, vertices
 
 
 @case("Very low permeability: 10⁴ to 10⁻⁶, first step far below h²/(6 c_v)",
@@ -205,7 +205,7 @@ def undrained(lab):
 
     def tip_of(run):
         x, _, values = pulmo.fields(run)
-        return values["displacement"].reshape(-1, 3)[np.abs(x[:, 0] - length) < 1e-9, 2].mean()
+        return values["displacement_mm"].reshape(-1, 3)[np.abs(x[:, 0] - length) < 1e-9, 2].mean()
 
     for name, law, poisson, meshes_of in scenes:
         E = 2 * mu * (1 + poisson)

@@ -43,7 +43,7 @@ def run(n, share):
                           ["-snes_atol", 1e-9 * share, "-traction_value", f"0,{TRACTION * share:.17g},0"] + mesh(n))
     points, _, steps = read_fields(case)
     assert abs(case.signals()["volume_ml"][-1]) < 1e-8 * share * case.json()["reference_volume_ml"]
-    u = steps[-1][1]["displacement"][:, 1]
+    u = steps[-1][1]["displacement_mm"][:, 1]
     return np.array([u[np.linalg.norm(points[:, :2] - tip, axis=1) < 1e-9].mean() for tip in TIPS]) / share
 
 
