@@ -216,7 +216,7 @@ PetscErrorCode equation(SceneRun &run, Airway &airway, Vec X, Vec F, PetscReal P
   PetscFunctionBeginUser;
   PetscCall(run.model().set_airway_nodes(X, P));
   PetscCall(airway.apply(X));
-  PetscCall(airway.close(V, F));
+  PetscCall(airway.close(V, X, F));
   PetscCall(run.model().carrier_value(F, c));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -346,7 +346,7 @@ TEST(AirwayModel, HeldRowsAndColumnsAreIdentity)
     SceneRun run(registry);
     State s;
     MatHandle A, dense;
-    VecHandle rows, F;
+    VecHandle rows, X, F;
     PetscInt n;
     PULMO_OK(prepare(run, scene.options()));
     PULMO_OK(random_state(run, 6, s));
@@ -358,7 +358,10 @@ TEST(AirwayModel, HeldRowsAndColumnsAreIdentity)
     PULMO_OK(VecDuplicate(rows, F.out()));
     PULMO_OK(run.model().set_airway_nodes(rows, 1)); // 1 on the nodes of the airway and the carrier
     PULMO_OK(VecSet(F, 3));
-    PULMO_OK(run.model().close_rows(F));
+    PULMO_OK(VecDuplicate(rows, X.out()));
+    PULMO_OK(run.model().set_step(s.dt, 0.5)); // the residual is x - value
+    PULMO_OK(run.model().set_airway_nodes(X, 0.75));
+    PULMO_OK(run.model().close_rows(X, F));
     PULMO_OK(VecGetSize(rows, &n));
     const ReadArray at_airway(rows), closed(F);
     const PetscScalar *a;
@@ -367,7 +370,7 @@ TEST(AirwayModel, HeldRowsAndColumnsAreIdentity)
     for (PetscInt i = 0; i < n; ++i) {
       if (at_airway[i] == 0) continue;
       ++held;
-      EXPECT_EQ(closed[i], 0);
+      EXPECT_EQ(closed[i], 0.25);
       for (PetscInt j = 0; j < n; ++j) {
         EXPECT_EQ(a[j * n + i], i == j ? 1 : 0);
         EXPECT_EQ(a[i * n + j], i == j ? 1 : 0);
