@@ -68,7 +68,7 @@ TEST_P(ElementPairs, FieldsAtVerticesAndMiddles)
   FieldWriter writer(output_, run_.scene(), run_.model());
   PULMO_OK(writer.snapshot(0, local_));
   const auto load = [&](const char *file, const char *name, VecHandle &v) -> PetscErrorCode {
-    ViewerHandle viewer;
+    Handle<PetscViewer, PetscViewerDestroy> viewer;
     PetscFunctionBeginUser;
     PetscCall(PetscViewerCreate(PETSC_COMM_SELF, viewer.out()));
     PetscCall(PetscViewerSetType(viewer, PETSCVIEWERHDF5));

@@ -296,7 +296,7 @@ TEST(SceneOptions, WhatPetscRenamedGoesByBothNames)
   const std::string scene =
       "-dm_plex_filename " + source("meshes/cube_coarse.msh") + " -mesh_scale 1 -pc_type lu -support -support_rigid";
   for (const char *name : {" -ts_dt", " -ts_time_step"}) {
-    Run run(Registry::standard());
+    pulmo::Run run(Registry::standard());
     PULMO_OK(prepare(run, scene + name + " 0.0125 -snes_linesearch_type secant"));
     EXPECT_EQ(run.simulation().wanted_dt(), 0.0125) << name;
     std::vector<std::pair<std::string, std::string>> list;
@@ -305,7 +305,7 @@ TEST(SceneOptions, WhatPetscRenamedGoesByBothNames)
     EXPECT_EQ(given["-ts_dt"], "0.0125");
     EXPECT_EQ(given["-snes_linesearch_type"], "l2");
   }
-  Run run(Registry::standard());
+  pulmo::Run run(Registry::standard());
   const std::string text = error_of([&] { return prepare(run, scene + " -ts_dt 0.1 -ts_time_step 0.2"); });
   EXPECT_HAS(text, "options -ts_dt and -ts_time_step are two names of the same");
 }
