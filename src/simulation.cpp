@@ -403,8 +403,13 @@ PetscErrorCode Simulation::guess(SNES snes, Vec X)
   PetscCall(airway_.guess(X));
   if (!predictor_.in_use()) PetscFunctionReturn(PETSC_SUCCESS);
   const auto hold = [this](Vec increment) -> PetscErrorCode {
+    PetscReal common = 0;
+
     PetscFunctionBeginUser;
-    if (airway_.mode() == Airway::Mode::held) PetscCall(model_.set_airway_nodes(increment, 0));
+    if (airway_.mode() == Airway::Mode::free) PetscFunctionReturn(PETSC_SUCCESS);
+    // one value for all nodes: those of steps with a free airway differ from node to node
+    if (airway_.mode() == Airway::Mode::common) PetscCall(model_.carrier_value(increment, common));
+    PetscCall(model_.set_airway_nodes(increment, common));
     PetscFunctionReturn(PETSC_SUCCESS);
   };
   PetscCall(predictor_.improve(snes, hold, X, start_norm_));

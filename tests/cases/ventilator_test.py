@@ -226,6 +226,16 @@ class Programmes(unittest.TestCase):
         for c in ("time_s", "airway_pressure_cmH2O", "flow_ml_per_s", "volume_ml"):
             np.testing.assert_array_equal(a.signals()[c], b.signals()[c])
 
+    def test_a_limit_after_a_flow_without_one(self):
+        """Nodes of a free airway have pressures of their own, and so have the past increments that reuse.opts guesses from;
+        a phase with a limit has one pressure for them all."""
+        scene = pulmo.SCENE + pulmo.LITRE + pulmo.QUIET + pulmo.UNIFORM + ["-airflow_permeability", "100"] + pulmo.programme(
+            "inspiration 0.3 flow 300\ninspiration 0.2 flow 300 limit 1000\n")
+        a, b = (pulmo.finished(pulmo.options_file(f"solvers/{solver}.opts") + scene) for solver in ("direct", "reuse"))
+        self.assertEqual(b.json()["rejected_steps"], 0)
+        for c in ("time_s", "airway_pressure_cmH2O", "flow_ml_per_s", "volume_ml"):
+            np.testing.assert_allclose(a.signals()[c], b.signals()[c], rtol=1e-6, atol=1e-6)
+
     def test_same_breath_as_the_mode(self):
         """VCV with PEEP, written as a file."""
         V_T, common = 180, pulmo.TIGHT + pulmo.SCENE + pulmo.LITRE + pulmo.QUIET
