@@ -63,7 +63,7 @@ def suction(lab):
     # the same suction on CM4 with little air: J = 0.7835 everywhere, the porosity 1 - (1 - Phi0)/J changes sign
     J = inflated("yoshihara", -20, 1e-3, 1)
     for porosity, alarm in ((0.3, False), (0.2, True)):
-        run = lab.finished(pulmo.DIRECT + pulmo.PINS + pulmo.BLOCK + [
+        run = lab.finished(pulmo.DIRECT + pulmo.PAPER + pulmo.PINS + pulmo.BLOCK + [
             "-tissue", "yoshihara", "-airflow", "-airflow_surfaces", "x1", "-airflow_permeability", 1e8, "-airflow_porosity", porosity] +
             pulmo.programme("suction 1 pressure -20 ramp 0.5"), f"Φ0 = {porosity}")
         if run:
@@ -71,7 +71,7 @@ def suction(lab):
             lab.demand(f"warned of it, Φ0 = {porosity}", "yes" if "porosity falls below zero" in run.out else "no",
                        "yes" if alarm else "no", alarm == ("porosity falls below zero" in run.out))
     # CM2 far down: no equilibrium with airflow holds; whatever happens is said
-    flat = lab.run(pulmo.DIRECT + pulmo.PINS + pulmo.BLOCK + [
+    flat = lab.run(pulmo.DIRECT + pulmo.PAPER + pulmo.PINS + pulmo.BLOCK + [
         "-tissue", "ma", "-airflow", "-airflow_surfaces", "x1", "-airflow_permeability", 1e8] +
         pulmo.programme("suction 4 pressure -150 ramp 4"))
     empty = flat.json(flat.summary_file)["min_jacobian"] < 0.01
