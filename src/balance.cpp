@@ -45,9 +45,13 @@ PetscReal Balance::share(const Errors &errors, PetscReal least, std::string &tex
 }
 
 PetscErrorCode Balance::judge(int breath, PetscReal volume, PetscReal pressure, const Errors &errors,
-                              const std::function<PetscErrorCode(PetscReal &)> &load, bool &solved)
+                              const std::function<PetscErrorCode(Loads &)> &load, bool &solved)
 {
+  Errors left = errors;
+
   PetscFunctionBeginUser;
+  step_drift_ = errors.net_gas;
+  left.gas = std::max(errors.gas, std::abs(drift_ + step_drift_));
   if (breath != breath_) {
     if (breath_ == 0) size_.gas = 0; // what filled the lung before its first breath is no tidal volume
     lowest_ = highest_ = volume;
@@ -57,19 +61,20 @@ PetscErrorCode Balance::judge(int breath, PetscReal volume, PetscReal pressure, 
   highest_ = std::max(highest_, volume);
   size_.gas = std::max(size_.gas, highest_ - lowest_);
   size_.pressure = std::max(size_.pressure, std::abs(pressure));
-  if (!(errors.force <= warning * size_.force)) { // an old load is no larger than the largest
-    PetscReal now;
+  if (!(left.force <= warning * size_.force && left.gas <= warning * size_.gas)) { // old loads are no larger
+    Loads now;
     PetscCall(load(now));
-    size_.force = std::max(size_.force, now);
+    size_.force = std::max(size_.force, now.force);
+    size_.gas = std::max(size_.gas, now.gas);
   }
-  const PetscReal left = share(errors, least_in_step, complaint_);
-  solved = left <= failure;
-  warns_ = !warned_ && left > warning;
+  const PetscReal most = share(left, least_in_step, complaint_);
+  solved = most <= failure;
+  warns_ = !warned_ && most > warning;
   warned_ = warned_ || warns_;
-  worst_share_ = std::max(worst_share_, left);
-  worst_.gas = std::max(worst_.gas, errors.gas);
-  worst_.force = std::max(worst_.force, errors.force);
-  worst_.pressure = std::max(worst_.pressure, errors.pressure);
+  worst_share_ = std::max(worst_share_, most);
+  worst_.gas = std::max(worst_.gas, left.gas);
+  worst_.force = std::max(worst_.force, left.force);
+  worst_.pressure = std::max(worst_.pressure, left.pressure);
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -88,6 +93,7 @@ PetscErrorCode Balance::persist(Archive &archive)
     PetscCall(archive.value(path + "_force_kPa_mm2", errors->force));
     PetscCall(archive.value(path + "_pressure_kPa", errors->pressure));
   }
+  PetscCall(archive.value("balance/drift_mm3", drift_));
   PetscCall(archive.value("balance/lowest_mm3", lowest_));
   PetscCall(archive.value("balance/highest_mm3", highest_));
   PetscCall(archive.value("balance/breath", breath_));

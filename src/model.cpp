@@ -547,12 +547,13 @@ PetscErrorCode Model::close_rows(Vec X, Vec F) const
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Model::residual_sums(Vec F, std::vector<PetscReal> &sums) const
+PetscErrorCode Model::residual_sums(Vec F, ResidualSums &sums) const
 {
   PetscInt first;
 
   PetscFunctionBeginUser;
-  sums.assign(field_rows_.size(), 0);
+  sums.absolute.assign(field_rows_.size(), 0);
+  sums.net.assign(field_rows_.size(), 0);
   PetscCall(VecGetOwnershipRange(F, &first, nullptr));
   {
     const ReadArray f(F);
@@ -561,34 +562,39 @@ PetscErrorCode Model::residual_sums(Vec F, std::vector<PetscReal> &sums) const
       PetscInt n;
       PetscCall(ISGetLocalSize(field_rows_[field], &n));
       PetscCall(ISGetIndices(field_rows_[field], &rows));
-      for (PetscInt i = 0; i < n; ++i) sums[field] += std::abs(f[rows[i] - first]) / row_scale_[field];
+      for (PetscInt i = 0; i < n; ++i) {
+        const PetscReal value = f[rows[i] - first] / row_scale_[field];
+        sums.absolute[field] += std::abs(value);
+        sums.net[field] += value;
+      }
       PetscCall(ISRestoreIndices(field_rows_[field], &rows));
     }
   }
-  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, sums.data(), static_cast<PetscMPIInt>(sums.size()), MPIU_REAL, MPI_SUM,
-                             PetscObjectComm((PetscObject)F)));
+  for (std::vector<PetscReal> *sum : {&sums.absolute, &sums.net})
+    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, sum->data(), static_cast<PetscMPIInt>(sum->size()), MPIU_REAL, MPI_SUM,
+                               PetscObjectComm((PetscObject)F)));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Model::loads(PetscReal t, Vec local, Vec F, PetscReal &sum)
+PetscErrorCode Model::loads(PetscReal t, Vec local, Vec F, PetscReal &force, PetscReal &gas)
 {
-  const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
   PetscSection section;
   PetscInt begin, end;
-  Vec rest, zero, force, total;
-  std::vector<PetscReal> sums;
+  Vec rest, zero, local_loads, loads;
+  ResidualSums sums;
+  PetscReal borne[2] = {0, 0}; // by field
 
   PetscFunctionBeginUser;
-  PetscReal borne = 0;
   {
     const ReadArray f(F);
-    for (const Prescribed &p : prescribed_)
-      if (composition().constraints()[p.constraint].field == displacement)
-        borne += std::abs(f[p.dof]) / row_scale_[displacement];
+    for (const Prescribed &p : prescribed_) {
+      const PetscInt field = composition().constraints()[p.constraint].field;
+      borne[field] += std::abs(f[p.dof]) / row_scale_[field];
+    }
   }
-  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &borne, 1, MPIU_REAL, MPI_SUM, comm));
-  for (Vec *v : {&rest, &zero, &force}) PetscCall(DMGetLocalVector(dm_, v));
-  PetscCall(DMGetGlobalVector(dm_, &total));
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, borne, 2, MPIU_REAL, MPI_SUM, PetscObjectComm((PetscObject)(DM)dm_)));
+  for (Vec *v : {&rest, &zero, &local_loads}) PetscCall(DMGetLocalVector(dm_, v));
+  PetscCall(DMGetGlobalVector(dm_, &loads));
   PetscCall(VecZeroEntries(zero));
   PetscCall(VecCopy(local, rest));
   PetscCall(DMGetLocalSection(dm_, &section));
@@ -602,13 +608,23 @@ PetscErrorCode Model::loads(PetscReal t, Vec local, Vec F, PetscReal &sum)
       std::fill_n(x.data() + offset, dofs, 0);
     }
   }
-  PetscCall(residual(t, rest, zero, force));
-  PetscCall(VecZeroEntries(total));
-  PetscCall(DMLocalToGlobal(dm_, force, ADD_VALUES, total));
-  PetscCall(residual_sums(total, sums));
-  sum = sums[displacement] + borne;
-  PetscCall(DMRestoreGlobalVector(dm_, &total));
-  for (Vec *v : {&rest, &zero, &force}) PetscCall(DMRestoreLocalVector(dm_, v));
+  const auto sum_at = [&](Vec state) -> PetscErrorCode {
+    PetscFunctionBeginUser;
+    PetscCall(residual(t, state, zero, local_loads));
+    PetscCall(VecZeroEntries(loads));
+    PetscCall(DMLocalToGlobal(dm_, local_loads, ADD_VALUES, loads));
+    PetscCall(residual_sums(loads, sums));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  };
+  PetscCall(sum_at(rest));
+  force = sums.absolute[displacement] + borne[displacement];
+  gas = 0;
+  if (sums.absolute.size() > pressure) {
+    PetscCall(sum_at(zero));
+    gas = sums.absolute[pressure] + borne[pressure];
+  }
+  PetscCall(DMRestoreGlobalVector(dm_, &loads));
+  for (Vec *v : {&rest, &zero, &local_loads}) PetscCall(DMRestoreLocalVector(dm_, v));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

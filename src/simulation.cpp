@@ -529,8 +529,7 @@ PetscErrorCode Simulation::accept_stage(PetscReal t, Vec X, PetscBool *accept)
 PetscErrorCode Simulation::judge(PetscReal t, PetscReal volume, PetscReal pressure, bool &solved)
 {
   Vec F;
-  std::vector<PetscReal> sums;
-  PetscReal flow = scheme_.flow(volume);
+  Model::ResidualSums sums;
   Balance::Errors errors;
 
   PetscFunctionBeginUser;
@@ -542,15 +541,18 @@ PetscErrorCode Simulation::judge(PetscReal t, PetscReal volume, PetscReal pressu
   if (airway_.mode() != Airway::Mode::free) PetscCall(model_.set_airway_nodes(F, 0)); // the flux that enters there
   PetscCall(model_.residual_sums(F, sums));
   PetscCall(DMRestoreGlobalVector(model_.dm(), &F));
-  if (scene_.facts().airflow) PetscCall(consistent_flow(flow));
   const Airway::Unmet unmet = airway_.unmet(volume);
-  const PetscReal lost = (scheme_.flow(volume) - flow) / scheme_.slope(),
-                  since_start = accepted_.volume * units::mm3_per_ml - delivered_ + lost;
-  errors.force = sums[displacement];
-  if (sums.size() > pulmo::pressure) errors.gas = sums[pulmo::pressure] / scheme_.slope();
-  errors.gas = std::max({errors.gas, unmet.volume, scheme_.half_step() ? 0 : std::abs(since_start)});
+  const bool gas_flows = sums.absolute.size() > pulmo::pressure;
+  errors.force = sums.absolute[displacement];
+  errors.gas = std::max(unmet.volume, gas_flows ? sums.absolute[pulmo::pressure] / scheme_.slope() : 0);
+  if (gas_flows && !scheme_.half_step()) errors.net_gas = sums.net[pulmo::pressure] / scheme_.slope();
   errors.pressure = unmet.pressure;
-  const auto load = [&](PetscReal &sum) { return model_.loads(t, local_, local_residual_, sum); };
+  const auto load = [&](Balance::Loads &loads) -> PetscErrorCode {
+    PetscFunctionBeginUser;
+    PetscCall(model_.loads(t, local_, local_residual_, loads.force, loads.gas));
+    loads.gas /= scheme_.slope();
+    PetscFunctionReturn(PETSC_SUCCESS);
+  };
   PetscCall(balance_.judge(static_cast<int>(phase_->breath), volume, pressure, errors, load, solved));
   std::ostringstream text;
   text << t;
@@ -693,6 +695,7 @@ PetscErrorCode Simulation::after_step()
   delivered_ += (row.volume - accepted_.volume) * units::mm3_per_ml - lost / scheme_.slope();
   PetscCall(scheme_.accept(model_, t, measures.volume_change, local_));
   step_control_.accept({t, row.volume, row.pressure});
+  balance_.accept();
   accepted_ = row;
   if (kink) {
     begin_smooth_stretch();

@@ -19,17 +19,26 @@ public:
   /// What a step leaves of its equations.
   struct Errors {
     PetscReal gas = 0;      ///< that the mass balance does not account for, or prescribed volume that is missed, mm^3
+    PetscReal net_gas = 0;  ///< gas that all nodes together gain by it, mm^3: adds up over the steps
     PetscReal force = 0;    ///< without balance: sum over the nodes, kPa mm^2
     PetscReal pressure = 0; ///< by which the ventilator's is missed, kPa
+  };
+
+  /// What the nodes balance, as sums over them.
+  struct Loads {
+    PetscReal force = 0; ///< kPa mm^2
+    PetscReal gas = 0;   ///< of sources, and through surfaces with a pressure other than the airway, mm^3 in the step
   };
 
   /// @p lung: volume at rest, mm^3; @p modulus: of the tissue, kPa.
   void setup(PetscReal lung, PetscReal modulus);
   /// Takes note of a step of @p breath that is to be accepted and ends at @p volume (mm^3 above rest) and @p pressure
-  /// (kPa). @p load gives the sum of the loads on the nodes, kPa mm^2; it is asked only if it matters. @p solved is
-  /// false if the step leaves too much; complaint() then tells what.
+  /// (kPa). @p load gives what acts on the nodes; it is asked only if it matters. @p solved is false if the step leaves
+  /// too much; complaint() then tells what.
   PetscErrorCode judge(int breath, PetscReal volume, PetscReal pressure, const Errors &errors,
-                       const std::function<PetscErrorCode(PetscReal &)> &load, bool &solved);
+                       const std::function<PetscErrorCode(Loads &)> &load, bool &solved);
+  /// The step that was judged last is accepted.
+  void accept() { drift_ += step_drift_; }
   /// At the end of the run: the same of its worst step.
   bool judge_run();
 
@@ -52,6 +61,7 @@ private:
   Errors size_;                        ///< largest so far: swing of the volume in a breath, load, pressure
   PetscReal lowest_ = 0, highest_ = 0; ///< volume in the breath at hand, mm^3
   PetscReal worst_share_ = 0;
+  PetscReal drift_ = 0, step_drift_ = 0; ///< gas without account: of the run so far, of the step judged last, mm^3
   int breath_ = 0;
   bool warned_ = false, warns_ = false;
   std::string complaint_;

@@ -46,11 +46,15 @@ public:
   /// Where the airway is held: writes x - value into the rows of its nodes and of the carrier in a global residual. The
   /// value is in place in every state that is integrated, so that this is zero unless @p X holds another.
   PetscErrorCode close_rows(Vec X, Vec F) const;
-  /// Sums of the absolute values of a global residual by field, in its units: kPa mm^2; mm^3/s.
-  PetscErrorCode residual_sums(Vec F, std::vector<PetscReal> &sums) const;
-  /// The sum of the absolute loads on the nodes, kPa mm^2: of the forces at F = I under the pressure of @p local (a
-  /// local vector), and of those that supports bear in the local residual @p F. The step must have been set.
-  PetscErrorCode loads(PetscReal t, Vec local, Vec F, PetscReal &sum);
+  /// Sums of a global residual over the nodes, by field and in its units: kPa mm^2; mm^3/s.
+  struct ResidualSums {
+    std::vector<PetscReal> absolute, net;
+  };
+  PetscErrorCode residual_sums(Vec F, ResidualSums &sums) const;
+  /// Sums of the absolute loads on the nodes. @p force, kPa mm^2: the forces at F = I under the pressure of @p local (a
+  /// local vector), and those that supports bear in the local residual @p F. @p gas, mm^3/s: sources at rest, and what
+  /// flows through nodes of a prescribed pressure other than the airway's. The step must have been set.
+  PetscErrorCode loads(PetscReal t, Vec local, Vec F, PetscReal &force, PetscReal &gas);
   /// A matrix for jacobian(), of type -dm_mat_type.
   PetscErrorCode create_matrix(Mat *A) const;
   /// Global Jacobian dF/dx + shift dF/dx_t, rows scaled.

@@ -94,7 +94,7 @@ class Pins(unittest.TestCase):
         case = pulmo.finished(BLOCK + ["-support", "-support_surfaces", "x0", "-support_components_x0", "x",
                                        "-support_displacement_x0", "2,0,0", "-support_rigid"])
         x, _, values = pulmo.fields(case)
-        u = values["displacement"].reshape(-1, 3)
+        u = values["displacement_mm"].reshape(-1, 3)
         np.testing.assert_array_equal(u[x.reshape(-1, 3)[:, 0] < 1e-9, 0], 2)
         self.assertLess(case.json()["pin_force_n"], 1e-10)
 

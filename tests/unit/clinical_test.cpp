@@ -98,7 +98,9 @@ TEST(Fit, WithInterceptCountsEveryRowOnce)
       for (int k = 0; k < 3; ++k) M[j][k] = k == column ? b[j] : A[j][k];
     return determinant(M) / determinant(A);
   };
-  const ClinicalNumbers n = overall_numbers(rows);
+  ClinicalNumbers n;
+  fit_with_intercept(rows, 0, rows.size() - 1, n);
+  fit_single_compartment(rows, 0, rows.size() - 1, 5, n);
   ASSERT_TRUE(n.equal_weight_compliance && n.compliance);
   EXPECT_NEAR(*n.equal_weight_compliance, 1 / unknown(0), 1e-6 / unknown(0));
   EXPECT_NEAR(*n.equal_weight_resistance, 1000 * unknown(1), 1e-6 * 1000 * unknown(1));

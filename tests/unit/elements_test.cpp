@@ -1,5 +1,6 @@
 // Element pairs: where their nodes lie, and what is written of them.
 #include "pulmo/output.hpp"
+#include "pulmo/units.hpp"
 #include "unit/scenes.hpp"
 #include "verification/support/fields.hpp"
 
@@ -83,14 +84,14 @@ TEST_P(ElementPairs, FieldsAtVerticesAndMiddles)
   PetscInt n;
   PULMO_OK(load("fields.h5", "geometry", geometry));
   PULMO_OK(load("fields_00000.h5", "displacement_mm", displacements));
-  PULMO_OK(load("fields_00000.h5", "pressure", pressures));
+  PULMO_OK(load("fields_00000.h5", "alveolar_pressure_cmH2O", pressures));
   PULMO_OK(VecGetSize(pressures, &n));
   EXPECT_GT(n, 14) << "more nodes than vertices";
   const ReadArray x(geometry), us(displacements), ps(pressures);
   for (PetscInt i = 0; i < n; ++i) {
     const double *at = x.data() + 3 * i;
     for (int d = 0; d < 3; ++d) EXPECT_NEAR(us[3 * i + d], u(at)[d], 1e-12);
-    EXPECT_NEAR(ps[i], p(at), 1e-12);
+    EXPECT_NEAR(ps[i] * units::kPa_per_cmH2O, p(at), 1e-12);
   }
 }
 

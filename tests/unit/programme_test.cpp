@@ -327,7 +327,7 @@ TEST(ProgrammeFile, ErrorsNameFileLineAndMend)
       {"repeat\na 1 hold\nend\n", "'repeat' takes one whole number"},
       {"repeat 2\na 1 hold\nend 3\n", "file:3: 'end' stands alone"},
       {"repeat 10000\nrepeat 10000\na 1 hold\nend\nend\n", "file:3: more than 1000000 phases"},
-      {"\x7f\x45\x4c\x46\x02\x01 1 hold\n", "a line starts with the phase's name"},
+      {"\x7f\x45\x4c\x46\x02\x01 1 hold\n", "line 1 holds bytes that are no text"},
   };
   for (const auto &[text, what] : wrong) {
     const std::string said = complaint(text);
