@@ -10,9 +10,9 @@ namespace pulmo {
 
 namespace {
 
-/// What volumes and loads count as at least, as a share of the lung's volume, or of the modulus: in a step, and over
-/// the run (rounding).
-constexpr PetscReal least_in_step = 1e-3, least_in_run = 1e-8;
+/// What volumes and loads count as at least, as a share of the lung's volume, or of the modulus on its surface: what is
+/// far below that, -snes_atol may leave.
+constexpr PetscReal least = 1e-3;
 
 constexpr double newton_per_kPa_mm2 = 1e-3;
 
@@ -24,7 +24,7 @@ void Balance::setup(PetscReal lung, PetscReal modulus)
   modulus_ = modulus;
 }
 
-PetscReal Balance::share(const Errors &errors, PetscReal least, std::string &text) const
+PetscReal Balance::share(const Errors &errors, std::string &text) const
 {
   const PetscReal surface = 6 * std::cbrt(lung_ * lung_); // of a cube
   const PetscReal gas = errors.gas / std::max(size_.gas, least * lung_),
@@ -67,7 +67,7 @@ PetscErrorCode Balance::judge(int breath, PetscReal volume, PetscReal pressure, 
     size_.force = std::max(size_.force, now.force);
     size_.gas = std::max(size_.gas, now.gas);
   }
-  const PetscReal most = share(left, least_in_step, complaint_);
+  const PetscReal most = share(left, complaint_);
   solved = most <= failure;
   warns_ = !warned_ && most > warning;
   warned_ = warned_ || warns_;
@@ -80,7 +80,7 @@ PetscErrorCode Balance::judge(int breath, PetscReal volume, PetscReal pressure, 
 
 bool Balance::judge_run()
 {
-  worst_share_ = share(worst_, least_in_run, complaint_);
+  worst_share_ = share(worst_, complaint_);
   return worst_share_ <= failure;
 }
 

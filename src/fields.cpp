@@ -380,12 +380,12 @@ PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
     if (gas) PetscCall(append_at(dm, node, pressure, x.data(), p));
   }
   for (PetscScalar &value : p) value /= units::kPa_per_cmH2O;
-  // cell means over the quadrature points
+  // cell means over the quadrature points; least J also at the corners, as in the signals
   std::vector<PointState> states;
   const auto &weights = assembly.relative_weights();
   for (PetscInt c = 0; c < assembly.cells(); ++c) {
     assembly.point_states(c, x.data(), states);
-    PetscScalar mean_J = 0, mean_h = 0, mean_m = 0, lowest = states.front().J;
+    PetscScalar mean_J = 0, mean_h = 0, mean_m = 0;
     for (std::size_t q = 0; q < weights.size(); ++q) {
       const PointState &s = states[q];
       PetscScalar P[9], sigma[9];
@@ -398,12 +398,12 @@ PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
       PetscScalar deviator[9];
       for (int i = 0; i < 9; ++i) deviator[i] = sigma[i] - (i % 4 == 0 ? h : 0);
       mean_J += weights[q] * s.J;
-      lowest = std::min(lowest, s.J);
       mean_h += weights[q] * h;
       mean_m += weights[q] * std::sqrt(1.5 * contract(deviator, deviator));
     }
     J.push_back(mean_J);
-    least_J.push_back(lowest);
+    least_J.push_back(
+        std::min_element(states.begin(), states.end(), [](const auto &a, const auto &b) { return a.J < b.J; })->J);
     hydrostatic.push_back(mean_h);
     von_mises.push_back(mean_m);
     if (gas) porosity.push_back(1 - (1 - scene_.airflow().porosity()) / mean_J);

@@ -12,8 +12,8 @@ namespace pulmo {
 /// moves and the loads that it bears. A right solver file leaves 1e-7 of these or less; above 1e-4 the run warns, above
 /// 1e-2 it ends.
 ///
-/// During the run a small volume or load counts as a thousandth of the lung's volume, or of the tissue's modulus on its
-/// surface, so that the first step of a ramp is not held against itself; at the end of the run it counts as what it is.
+/// A small volume or load counts as a thousandth of the lung's volume, or of the tissue's modulus on its surface, so
+/// that neither the first step of a ramp nor what -snes_atol leaves of a faint load is held against itself.
 class Balance {
 public:
   /// What a step leaves of its equations.
@@ -53,8 +53,8 @@ public:
   PetscErrorCode persist(Archive &archive);
 
 private:
-  /// The largest share of @p errors in the sizes so far, which count as @p least at least.
-  PetscReal share(const Errors &errors, PetscReal least, std::string &text) const;
+  /// The largest share of @p errors in the sizes so far.
+  PetscReal share(const Errors &errors, std::string &text) const;
 
   PetscReal lung_ = 1, modulus_ = 1;
   Errors worst_;                       ///< of the run, each

@@ -433,7 +433,7 @@ def table(m):
         "a folder as programme": (lung + ["-ventilator", "programme", "-ventilator_programme", m["folder"]],
                                   ["-ventilator_programme", m["folder"], "check its name"]),
         "empty programme": (file_of("empty.txt", b""), ["empty.txt holds no phase", "inspiration 1.0 pressure 15"]),
-        "binary programme": (file_of("junk.bin", bytes(range(256)) * 20), ["junk.bin:", "starts with the phase's name"]),
+        "binary programme": (file_of("junk.bin", bytes(range(256)) * 20), ["junk.bin:", "holds bytes that are no text"]),
         "a wrong line": (file_of("wrong.txt", b"settle 1 pressure 5\n# fine so far\ninspiration 1 presure 15\n"),
                          ["wrong.txt:3:", "'presure'", "pressure, flow or hold"]),
         "a repeat without end": (file_of("open.txt", b"a 1 hold\nrepeat 3\nb 1 hold\n"), ["open.txt:2:", "'repeat'", "'end'"]),

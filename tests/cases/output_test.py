@@ -188,8 +188,12 @@ class Breaths(unittest.TestCase):
             C, R = fit(rows, PEEP)
             plateau = [p for p, name in zip(P[1:], rows["phase"][1:]) if name == "pause"][-1]
             work = np.trapz(P - PEEP, V) * pulmo.KPA_PER_CMH2O * 1e-3
+            # each row once, with an intercept
+            samples = np.column_stack([V[1:], Q[1:], np.ones(len(V) - 1)])
+            E_even, R_even, _ = np.linalg.lstsq(samples, P[1:], rcond=None)[0]
             expected = {
-                "compliance_ml_per_cmH2O": C, "resistance_cmH2O_s_per_l": R, "time_constant_s": C * R / 1000,
+                "compliance_equal_weights_ml_per_cmH2O": 1 / E_even,
+                "resistance_equal_weights_cmH2O_s_per_l": 1000 * R_even, "compliance_ml_per_cmH2O": C, "resistance_cmH2O_s_per_l": R, "time_constant_s": C * R / 1000,
                 "peak_inspiratory_pressure_cmH2O": P.max(), "plateau_pressure_cmH2O": plateau,
                 "driving_pressure_cmH2O": plateau - PEEP, "tidal_volume_ml": V.max() - V[0],
                 "trapped_volume_ml": V[-1] - V[0], "peak_flow_ml_per_s": Q[1:].max(), "work_j": work,

@@ -94,7 +94,7 @@ class ClosedForms(unittest.TestCase):
 
     @staticmethod
     def options(law, support, J, dt):
-        return pulmo.TIGHT + pulmo.BLOCK + pulmo.QUIET + support + [
+        return pulmo.TIGHT + pulmo.BLOCK + pulmo.PAPER + pulmo.QUIET + support + [
             "-tissue", law, "-ventilator", "vcv", "-ventilator_tidal_volume", 1000 * (J - 1), "-ts_dt", dt,
             "-ventilator_pause", "0.1", "-ts_max_time", "1.1"]
 
