@@ -2,6 +2,7 @@
 
 #include "pulmo/checkpoint.hpp"
 #include "pulmo/errors.hpp"
+#include "pulmo/free_boundary.hpp"
 #include "pulmo/held.hpp"
 
 #include <algorithm>
@@ -101,6 +102,22 @@ PetscErrorCode warn_of_no_air(MPI_Comm comm, const Scene &scene, const Simulatio
                     (double)row.time, (double)row.min_J, (double)least, (double)scene.airflow().porosity()));
     break;
   }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Says where the volume of a ventilated lung is no animal's: a shrew's has 0.05 ml, an elephant's a hundred litres.
+PetscErrorCode warn_of_size(MPI_Comm comm, const Scene &scene)
+{
+  constexpr PetscReal least = 0.02, largest = 2e5; // ml
+  const PetscReal volume = scene.mesh().volume() / units::mm3_per_ml;
+
+  PetscFunctionBeginUser;
+  if (scene.facts().ventilator && (volume < least || volume > largest))
+    PetscCall(PetscPrintf(comm,
+                          "pulmo: warning: the lung has %.3g ml, %s than any animal's: coordinates times -mesh_scale "
+                          "have to be mm; give the -mesh_scale that makes them so (a man's lung has 2000 to 6000 ml, a "
+                          "mouse's 0.2 ml)\n",
+                          (double)volume, volume < least ? "less" : "more"));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -265,6 +282,8 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
     PetscFunctionReturn(PETSC_SUCCESS);
   }
   PetscCall(check_held(comm, scene, run.model().composition()));
+  PetscCall(note_free_boundary(run.model().composition(), scene.facts().airflow));
+  PetscCall(warn_of_size(comm, scene));
   if (!run.settle_note().empty()) PetscCall(PetscPrintf(comm, "pulmo: note: %s\n", run.settle_note().c_str()));
   PetscCall(note_no_breath(comm, scene));
   PetscCall(error_estimate.check(options, scene));

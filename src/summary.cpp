@@ -1,3 +1,4 @@
+#include "pulmo/free_boundary.hpp"
 #include "pulmo/output.hpp"
 #include "pulmo/units.hpp"
 
@@ -93,6 +94,20 @@ Json diagnosis_json(const Diagnosis &d)
   return json;
 }
 
+/// Boundary that no effect uses.
+Json free_boundary_json(const std::vector<FreeBoundary> &parts)
+{
+  Json list = Json::array();
+  for (const FreeBoundary &p : parts)
+    list.push_back({{"name", p.name.empty() ? Json(nullptr) : Json(p.name)},
+                    {"area_mm2", p.area},
+                    {"share", p.share},
+                    {"centroid_mm", p.centroid},
+                    {"lowest_mm", p.lowest},
+                    {"highest_mm", p.highest}});
+  return list;
+}
+
 /// Error bars by the key of their number, and the runs they come from.
 Json errors_json(const ErrorReport &report)
 {
@@ -137,6 +152,8 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
   PetscCallMPI(MPI_Comm_rank(comm, &rank));
   PetscCallMPI(MPI_Comm_size(comm, &size));
   PetscCall(VecGetSize(simulation.state(), &dofs));
+  std::vector<FreeBoundary> free_boundary;
+  PetscCall(find_free_boundary(model.composition(), free_boundary));
   PetscCall(options.all_used(used));
   const std::string file = output.path(finished ? "summary.json" : "failure.json");
   if (rank == 0) {
@@ -185,6 +202,7 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
     }
     json["surface_area_mm2"] = total;
     json["surface_areas_mm2"] = areas;
+    json["free_boundary"] = free_boundary_json(free_boundary);
     if (scene.facts().airflow) json["mass_balance_error_ml"] = simulation.mass_balance_error() / units::mm3_per_ml;
     if (model.composition().supported())
       json["support_reaction_n"] = simulation.support_reaction() * units::newton_per_kPa_mm2;

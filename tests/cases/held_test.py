@@ -9,7 +9,7 @@ import case_meshes
 import pulmo_case as pulmo
 
 SCENE = pulmo.DIRECT + pulmo.QUIET + ["-tissue", "yoshihara", "-ventilator", "pcv", "-ventilator_pip", 4, "-ts_dt", 0.5,
-                                      "-ts_max_time", 1]
+                                      "-ts_max_time", 1, "-ventilator_settle", "off"]
 BLOCK = SCENE + pulmo.BLOCK  # a cube of 100 mm
 ROLLER = ["-support", "-support_surfaces", "z0", "-support_components_z0", "z"]
 SPRINGS = ["-chest_wall", "-chest_wall_surfaces", "x0,z1"]
@@ -41,7 +41,10 @@ def two_cubes(shift):
     unique, number = np.unique(np.round(both, 9), axis=0, return_inverse=True)
     number = number.reshape(-1)
     n = len(points)
-    return case_meshes.write(unique, number[np.vstack([tets, tets + n])], number[np.vstack([facets, facets + n])], names)
+    tets, facets = number[np.vstack([tets, tets + n])], number[np.vstack([facets, facets + n])]
+    outer = {tuple(f) for f in case_meshes.boundary(tets)}
+    kept = [i for i, f in enumerate(np.sort(facets, axis=1)) if tuple(f) in outer]  # not where the cubes are joined
+    return case_meshes.write(unique, tets, facets[kept], [names[i] for i in kept])
 
 
 class FreeMotions(unittest.TestCase):
@@ -130,6 +133,27 @@ class Prescribed(unittest.TestCase):
         self.assertEqual(len(told), 1)
         for word in ("-support_displacement_x0 gives 2 mm along y", "-support_components_x0 x"):
             self.assertIn(word, told[0])
+
+
+class Boundary(unittest.TestCase):
+    def test_what_no_effect_uses_is_told(self):
+        for ranks in (1, 2):
+            case = pulmo.finished(BLOCK + ["-chest_wall", "-chest_wall_surfaces", "x0,y0,y1,z0,z1"], ranks=ranks)
+            told, = [line for line in case.out.splitlines() if "no effect uses" in line]
+            for word in ("'x1' (1e+04 mm^2, 16.7 %", "around (100, 50, 50)"):
+                self.assertIn(word, told)
+            part, = case.json()["free_boundary"]
+            self.assertEqual(part["name"], "x1")
+            self.assertAlmostEqual(part["share"], 1 / 6, delta=1e-12)
+            np.testing.assert_allclose(part["centroid_mm"], [100, 50, 50], rtol=1e-12)
+
+    def test_a_lung_of_no_animal(self):
+        for scale, size in ((1, "less"), (1000, "more")):
+            case = pulmo.finished(SCENE + ["-dm_plex_filename", pulmo.mesh("cube_coarse.msh"), "-mesh_scale", scale,
+                                           "-chest_wall", "-chest_wall_surfaces", "x0"])
+            told = [line for line in warnings(case) if "-mesh_scale" in line]
+            self.assertEqual(len(told), 1, case.tail())
+            self.assertIn(size + " than any animal's", told[0])
 
 
 if __name__ == "__main__":
