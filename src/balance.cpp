@@ -8,16 +8,6 @@
 
 namespace pulmo {
 
-namespace {
-
-/// What volumes and loads count as at least, as a share of the lung's volume, or of the modulus on its surface: what is
-/// far below that, -snes_atol may leave.
-constexpr PetscReal least = 1e-3;
-
-constexpr double newton_per_kPa_mm2 = 1e-3;
-
-} // namespace
-
 void Balance::setup(PetscReal lung, PetscReal modulus)
 {
   lung_ = lung;
@@ -36,7 +26,8 @@ PetscReal Balance::share(const Errors &errors, std::string &text) const
   if (gas == largest)
     words << errors.gas / units::mm3_per_ml << " ml of gas, " << gas << " of what the lung took in and gave back";
   else if (force == largest)
-    words << "forces of " << errors.force * newton_per_kPa_mm2 << " N without balance, " << force << " of the load";
+    words << "forces of " << errors.force * units::newton_per_kPa_mm2 << " N without balance, " << force
+          << " of the load";
   else
     words << "a difference of " << errors.pressure / units::kPa_per_cmH2O << " cmH2O to the ventilator's pressure, "
           << pressure << " of it";

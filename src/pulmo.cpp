@@ -4,6 +4,7 @@
 #include "pulmo/errors.hpp"
 #include "pulmo/free_boundary.hpp"
 #include "pulmo/held.hpp"
+#include "pulmo/units.hpp"
 
 #include <algorithm>
 #include <csignal>
@@ -160,18 +161,23 @@ private:
   bool done_ = false;
 };
 
-/// Holds the energy that the steps of a run lost or made against the work that was given.
-PetscErrorCode hold_energy(MPI_Comm comm, const EnergyAudit &energy, Simulation &simulation, bool &finished)
+/// Holds the energy that the steps of a run lost or made against the work that was given, which counts as what strains
+/// the lung by Balance::least at least.
+PetscErrorCode hold_energy(MPI_Comm comm, const EnergyAudit &energy, const Model &model, Simulation &simulation,
+                           bool &finished)
 {
+  const double least = Balance::least * Balance::least * model.modulus() * model.composition().mesh().volume() *
+                       units::j_per_kPa_mm3,
+               share = std::min<double>(energy.worst_share(), energy.worst_residual() / least);
   std::ostringstream text;
 
   PetscFunctionBeginUser;
   text.precision(2);
-  text << energy.worst_residual() << " J without account, " << energy.worst_share() << " of the work";
-  finished = energy.worst_share() <= Balance::failure;
+  text << energy.worst_residual() << " J without account, " << share << " of the work";
+  finished = share <= Balance::failure;
   if (!finished)
     PetscCall(simulation.end_unsolved("the run was not solved", text.str()));
-  else if (energy.worst_share() > Balance::warning)
+  else if (share > Balance::warning)
     PetscCall(
         PetscPrintf(comm, "pulmo: warning: the run is hardly solved: the solver leaves %s\n", text.str().c_str()));
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -332,7 +338,7 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
     if (simulation.stopped()) PetscCall(stop(checkpoint, simulation, signal.name()));
     PetscCall(signal.asked(asked_to_stop)); // in the last step
   }
-  if (finished && audit_energy) PetscCall(hold_energy(comm, energy, simulation, finished));
+  if (finished && audit_energy) PetscCall(hold_energy(comm, energy, run.model(), simulation, finished));
   PetscCall(options.warn_unused(scene.facts().airflow, true));
   PetscCall(warn_of_no_air(comm, scene, simulation));
   PetscCall(simulation.pins().warn(run.model()));

@@ -49,6 +49,9 @@ public:
   /// The largest share that a step of the run left; after judge_run() with the sizes of the whole run.
   PetscReal worst() const { return worst_share_; }
   static constexpr PetscReal warning = 1e-4, failure = 1e-2;
+  /// What volumes and loads count as at least, as a share of the lung's volume, or of the modulus on its surface: what
+  /// is far below that, -snes_atol may leave.
+  static constexpr PetscReal least = 1e-3;
 
   PetscErrorCode persist(Archive &archive);
 

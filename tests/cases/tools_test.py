@@ -172,7 +172,7 @@ class Tools(unittest.TestCase):
         self.assertEqual(failed.code, 2, failed.tail())
         drawn = tool("report", failed.directory)
         self.assertEqual(drawn.returncode, 0, drawn.stderr)
-        self.assertIn("report: FAILED: no step could be accepted", drawn.stdout)
+        self.assertIn("report: FAILED: steps only crawl", drawn.stdout)
         self.assertIn("waveforms.png", failed.files())
         os.remove(failed.path("failure.json"))
         with open(failed.path("signals.csv.part"), "a") as f:
@@ -206,7 +206,7 @@ class Tools(unittest.TestCase):
         self.assertIn("-blah", rows[1]["remark"])
         self.assertGreater(float(rows[1]["memory MB"]), 10)
 
-        twin = [pulmo.finished(options + pulmo.PCV + pulmo.CUBE + ["-ts_max_time", "0.1"])
+        twin = [pulmo.finished(options + pulmo.options_file("scenes/pcv.opts") + pulmo.CUBE + ["-ts_max_time", "0.1"])
                 for options in (pulmo.DIRECT, pulmo.options_file("solvers/iterative.opts") + ["-ksp_rtol", "1e-3"])]
         for row, case in zip(rows, twin):
             summary = case.json()
