@@ -21,9 +21,9 @@ from plane_strain import CORNERS, SHEAR, TIPS, TRACTION, Membrane  # noqa: E402
 LEVELS = (4, 8, 16)  # bricks along each side
 SMALL = 1e-5  # share of the load of the linear problem
 # a closed airway: no gas flows in or out; within the tissue next to none in the second that the step takes
-SCENE = ["-tissue", "yoshihara", "-tissue_c", SHEAR / 2, "-support", "-support_surfaces", "clamped,faces",
+SCENE = pulmo.PAPER + ["-tissue", "yoshihara", "-tissue_c", SHEAR / 2, "-support", "-support_surfaces", "clamped,faces",
          "-support_components_clamped", "xyz", "-support_components_faces", "z", "-traction", "-traction_surfaces", "loaded",
-         "-airflow", "-airflow_surfaces", "free", "-lumen_pressure", "off", "-airflow_permeability", 1e-9, "-ts_dt", 1, "-mesh_scale", 1]
+         "-airflow", "-airflow_surfaces", "free", "-airflow_permeability", 1e-9, "-ts_dt", 1, "-mesh_scale", 1]
 
 
 def mesh(n):
