@@ -13,7 +13,7 @@ from .keys import make_lung
 from .plots import plt
 from .strategies import measure, solver_words
 
-ENTRIES = ["@direct -snes_lag_jacobian -2 -snes_rtol 1e-3", "@iterative"]
+ENTRIES = ["@direct -snes_lag_jacobian -2 -snes_max_it 100", "@iterative"]
 STEP = 0.05  # s
 # event of PETSc's log in which a part is allocated; what is left is the mesh, vectors, program and libraries
 PARTS = {"matrix": "DMCreateMat", "preconditioner": "PCSetUp", "Krylov solve": "KSPSolve"}
