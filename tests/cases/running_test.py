@@ -267,7 +267,7 @@ class Sources(unittest.TestCase):
 
     def test_words_with_other_dashes_and_capitals(self):
         self.refused(self.run_with(["\u2013ts_dt", "0.1"]), "an en dash")
-        self.refused(self.run_with(["-TS_dt", "0.1"]), "-TS_dt", "small letters")
+        self.refused(self.run_with(["-TS_adapt_dt_min", "0.01"]), "-TS_adapt_dt_min", "small letters")
 
     def test_what_nothing_used_is_told_after_the_first_step(self):
         for solver in "iterative", "iterative_hypre", "iterative_ml", "reuse":
