@@ -1,6 +1,7 @@
 #include "pulmo/checkpoint.hpp"
 
 #include "pulmo/named_parts.hpp"
+#include "pulmo/text_file.hpp"
 #include "pulmo/whole_file.hpp"
 
 #include <algorithm>
@@ -43,24 +44,6 @@ bool begins_with_one_of(const List &prefixes, const std::string &option)
 bool is_free(const std::string &option)
 {
   return option != flow_split && begins_with_one_of(free_prefixes, option);
-}
-
-std::string text_of(const OptionList &list)
-{
-  std::string text;
-  for (const auto &[name, value] : list) text += name + " " + value + "\n";
-  return text;
-}
-
-OptionList read_options(const std::string &text)
-{
-  OptionList list;
-  std::istringstream lines(text);
-  for (std::string line; std::getline(lines, line);) {
-    const std::size_t space = line.find(' ');
-    if (space != std::string::npos) list.emplace_back(line.substr(0, space), line.substr(space + 1));
-  }
-  return list;
 }
 
 std::optional<std::string> value_in(const OptionList &list, const std::string &name)
@@ -237,7 +220,7 @@ PetscErrorCode Checkpoint::persist_names(Archive &archive)
 
 PetscErrorCode Checkpoint::compare_options(const std::string &stored) const
 {
-  const OptionList then = read_options(stored), now = options_.own_used();
+  const OptionList then = named_values(stored), now = options_.own_used();
 
   PetscFunctionBeginUser;
   const auto refuse = [&](const std::string &name) -> PetscErrorCode {
@@ -271,7 +254,7 @@ PetscErrorCode Checkpoint::persist_numerics(Archive &archive)
   PetscCall(archive.text("numerics", text));
   PetscCall(archive.text("numerics_changed", numerics_changed_));
   if (!archive.reading() || !numerics_changed_.empty()) PetscFunctionReturn(PETSC_SUCCESS);
-  const OptionList then = read_options(text);
+  const OptionList then = named_values(text);
   const auto compare = [&](const OptionList &list, const OptionList &other) {
     for (const auto &[name, value] : list) {
       const auto elsewhere = value_in(other, name);

@@ -74,19 +74,6 @@ Direction direction(PetscReal polar, PetscReal azimuth)
   return {std::sin(polar) * std::cos(azimuth), std::sin(polar) * std::sin(azimuth), std::cos(polar)};
 }
 
-/// Stiffest entry of the tangent at rest, kPa.
-PetscReal modulus_at_rest(const TissueLaw &law)
-{
-  const PetscScalar zero[9] = {0};
-  PetscScalar A[81];
-  PointState rest;
-  make_point_state(zero, nullptr, rest);
-  law.tangent(rest, A);
-  PetscReal largest = 0;
-  for (PetscScalar a : A) largest = std::max(largest, std::abs(a));
-  return largest;
-}
-
 /// Distance of a point from a segment.
 PetscReal distance(const PetscReal x[3], const RimSegment &s)
 {
@@ -156,9 +143,8 @@ PetscErrorCode look_at_tissue(const Scene &scene, const Model &model, Vec local,
   PetscFunctionBeginUser;
   make_point_state(zero, nullptr, state);
   d.acoustic_at_rest = acoustic_stiffness(law, state).least;
-  const PetscReal modulus = modulus_at_rest(law);
   const auto lost = [&](PetscReal stiffness, PetscReal at_rest) {
-    return stiffness < std::max<PetscReal>(no_stiffness * at_rest, 0) - rounding * modulus;
+    return stiffness < std::max<PetscReal>(no_stiffness * at_rest, 0) - rounding * model.modulus();
   };
   PetscCall(sampling.setup(model));
   {

@@ -10,6 +10,7 @@
 #include <csignal>
 #include <cstring>
 #include <sstream>
+#include <unistd.h>
 
 namespace pulmo {
 
@@ -19,6 +20,9 @@ namespace {
 PetscErrorCode handle_signal(int signal, void *)
 {
   RunLock::abandon();
+  // what follows may wait for ever for a lock that the interrupted code holds
+  (void)std::signal(SIGALRM, [](int) { _exit(PULMO_COULD_NOT_GO_ON); });
+  (void)alarm(10); // s
   if (signal == SIGTERM || signal == SIGHUP || signal == SIGQUIT)
     (void)std::fprintf(stderr, "pulmo: error: stopped by signal %d (%s) while nothing was at hand that could be kept\n",
                        signal, strsignal(signal));
@@ -114,11 +118,12 @@ PetscErrorCode warn_of_size(MPI_Comm comm, const Scene &scene)
 
   PetscFunctionBeginUser;
   if (scene.facts().ventilator && (volume < least || volume > largest))
-    PetscCall(PetscPrintf(comm,
-                          "pulmo: warning: the lung has %.3g ml, %s than any animal's: coordinates times -mesh_scale "
-                          "have to be mm; give the -mesh_scale that makes them so (a man's lung has 2000 to 6000 ml, a "
-                          "mouse's 0.2 ml)\n",
-                          (double)volume, volume < least ? "less" : "more"));
+    PetscCall(
+        PetscPrintf(comm,
+                    "pulmo: warning: the lung has %.3g ml, %s than any animal's: coordinates times -mesh_scale "
+                    "have to be mm; give the -mesh_scale that makes them so (an adult's lung has 2000 to 6000 ml, a "
+                    "mouse's 0.2 ml)\n",
+                    (double)volume, volume < least ? "less" : "more"));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -1,5 +1,7 @@
 #include "pulmo/run_lock.hpp"
 
+#include "pulmo/text_file.hpp"
+
 #include <cerrno>
 #include <climits>
 #include <csignal>
@@ -78,20 +80,10 @@ Owner this_process()
           {"namespace", link_of("/proc/self/ns/pid")}};
 }
 
-std::string text_of(const Owner &owner)
-{
-  std::string text;
-  for (const auto &[key, value] : owner) text += key + " " + value + "\n";
-  return text;
-}
-
 Owner read_owner(const std::string &text)
 {
-  Owner owner;
-  std::istringstream lines(text);
-  for (std::string line; std::getline(lines, line);)
-    owner[line.substr(0, line.find(' '))] = line.find(' ') == std::string::npos ? "" : line.substr(line.find(' ') + 1);
-  return owner;
+  const NamedValues list = named_values(text);
+  return {list.begin(), list.end()};
 }
 
 enum class State { alive, gone, unknown };
@@ -201,7 +193,9 @@ std::string RunLock::user_of(const std::string &directory)
 std::string RunLock::take(const std::string &directory)
 {
   std::string own, there;
-  const std::string lock = directory + "/" + lock_name, claim = lock + ".next", text = text_of(this_process());
+  const std::string lock = directory + "/" + lock_name, claim = lock + ".next";
+  const Owner process = this_process();
+  const std::string text = text_of(NamedValues(process.begin(), process.end()));
   int error = write_own(directory, text, own), looks = 0;
   bool busy = false; // the lock, or a left one, changes hands
 

@@ -44,6 +44,24 @@ std::vector<std::string> lines_of(const std::string &text)
   return lines;
 }
 
+std::string text_of(const NamedValues &list)
+{
+  std::string text;
+  for (const auto &[name, value] : list) text += name + " " + value + "\n";
+  return text;
+}
+
+NamedValues named_values(const std::string &text)
+{
+  NamedValues list;
+  for (const std::string &line : lines_of(text)) {
+    const std::size_t blank = line.find(' ');
+    if (!line.empty())
+      list.emplace_back(line.substr(0, blank), blank == std::string::npos ? "" : line.substr(blank + 1));
+  }
+  return list;
+}
+
 bool read_text(const std::string &file, std::size_t most, std::string &text)
 {
   std::error_code error;

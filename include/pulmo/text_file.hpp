@@ -3,6 +3,7 @@
 #pragma once
 
 #include <string>
+#include <utility>
 #include <vector>
 
 namespace pulmo {
@@ -13,6 +14,11 @@ std::string clean_text(std::string &text);
 
 /// The lines of a clean text.
 std::vector<std::string> lines_of(const std::string &text);
+
+/// Names and values as text, a line "name value" for each, and back. A name has no blanks.
+using NamedValues = std::vector<std::pair<std::string, std::string>>;
+std::string text_of(const NamedValues &list);
+NamedValues named_values(const std::string &text);
 
 /// The first bytes of @p file, @p most at most; false if it cannot be read.
 bool read_text(const std::string &file, std::size_t most, std::string &text);
