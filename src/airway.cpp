@@ -80,7 +80,7 @@ PetscErrorCode Airway::apply(Vec X)
   PetscFunctionBeginUser;
   if (mode_ == Mode::common && !frozen_) PetscCall(model_.carrier_value(X, pressure_));
   model_.hold_airway(mode_ != Mode::free);
-  PetscCall(model_.set_step(1 / scheme_.slope(), pressure_, mode_ == Mode::free ? flow() : 0));
+  PetscCall(model_.set_step(scheme_.stage(), pressure_, mode_ == Mode::free ? flow() : 0));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -79,8 +79,6 @@ PetscErrorCode EnergyAudit::setup()
     part.account.push_back(account(term.account, term.kind));
   }
   PetscCall(DMCreateLocalVector(model_.dm(), before_.out()));
-  PetscCall(VecDuplicate(before_, rate_.out()));
-  PetscCall(VecDuplicate(before_, residual_.out()));
   PetscCall(DMGetLocalSection(model_.dm(), &section));
   PetscCall(PetscSectionGetChart(section, &begin, &end));
   for (PetscInt p = begin; p < end; ++p) {
@@ -117,10 +115,9 @@ PetscErrorCode EnergyAudit::integrate(const Part &part, const StepReport &step, 
   const PetscScalar *constants;
   std::vector<Sample> now, before;
   const PetscReal t = step.row.time, dt = step.row.dt;
-  Step step_now{}, step_before{};
+  Step step_now(dt), step_before(dt);
 
   PetscFunctionBeginUser;
-  step_now.dt = step_before.dt = dt;
   step_now.load = model_.load();
   step_now.gas_pressure = step.row.pressure * units::kPa_per_cmH2O;
   step_before.gas_pressure = gas_pressure_;
@@ -132,6 +129,7 @@ PetscErrorCode EnergyAudit::integrate(const Part &part, const StepReport &step, 
     sampling_.sample(e, x.data(), now);
     sampling_.sample(e, x_before.data(), before);
     for (std::size_t q = 0; q < weights.size(); ++q) {
+      Sampling::make_rates(before[q], dt, now[q]);
       const Point a = sampling_.point(now[q], e, t, step_now), b = sampling_.point(before[q], e, t - dt, step_before);
       for (std::size_t k = 0; k < part.terms.size(); ++k)
         sums[part.account[k]] += weights[q] * e.measure * part.terms[k]->density(a, b, constants);
@@ -153,10 +151,7 @@ PetscErrorCode EnergyAudit::add_support_work(const StepReport &step, double &sum
   PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &moved, 1, MPI_INT, MPI_LOR, comm));
   if (!moved) PetscFunctionReturn(PETSC_SUCCESS);
   // the residual of a held row is the force that its support bears
-  PetscCall(VecWAXPY(rate_, -1, before_, step.local));
-  PetscCall(VecScale(rate_, 1 / step.row.dt));
-  PetscCall(model_.residual(step.row.time, step.local, rate_, residual_));
-  const ReadArray x(step.local), x_before(before_), f(residual_);
+  const ReadArray x(step.local), x_before(before_), f(step.residual);
   for (PetscInt dof : held_) sum += f[dof] / model_.row_scale(displacement) * (x[dof] - x_before[dof]);
   PetscFunctionReturn(PETSC_SUCCESS);
 }

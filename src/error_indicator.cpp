@@ -239,7 +239,7 @@ PetscErrorCode ErrorIndicator::estimate(Vec local, CellErrors &errors)
   std::vector<PetscScalar> stresses, gradients;
   PetscDS ds;
   const PetscScalar *constants;
-  Step second{};
+  const Step second; // the densities of a step of 1 s are powers
 
   PetscFunctionBeginUser;
   PetscCall(DMGetDS(model_.dm(), &ds));
@@ -267,7 +267,6 @@ PetscErrorCode ErrorIndicator::estimate(Vec local, CellErrors &errors)
   PetscCall(stress_.fit(stresses, 9));
   if (gas) PetscCall(gradient_.fit(gradients, 3));
 
-  second.dt = 1;
   PetscReal whole[2] = {0, 0};
   errors.tissue.assign(cells.size(), 0);
   errors.flow.assign(gas ? cells.size() : 0, 0);

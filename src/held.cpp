@@ -97,7 +97,7 @@ std::vector<Hold> holds_of(const Composition &composition)
 /// The force per displacement that a term answers with at rest, K[3 i + j].
 class Resistance {
 public:
-  explicit Resistance(const Composition &composition) : constants_(composition.constants({1, 0, 0, 1}))
+  explicit Resistance(const Composition &composition) : constants_(composition.constants(Step()))
   {
     PetscInt components = 0;
     for (const FieldSpec &field : composition.fields()) {

@@ -282,14 +282,14 @@ public:
     const Clock clock(*this, reinterpret_cast<void (*)(void)>(g));
     for (PetscInt q = 0; q < data.fields->points; ++q)
       g(dim, data.fields->n, precomputed_state, data.fields->uOff, data.fields->uOff_x, u(q), u_t(q), u_x(q), nullptr,
-        nullptr, state(q), nullptr, nullptr, t, shift, data.x + q * dim, nc, constants, out + q * stride);
+        data.fields->uOff_x, state(q), nullptr, rate_x(q), t, shift, data.x + q * dim, nc, constants, out + q * stride);
   }
   void operator()(PetscBdPointFunc f, PetscScalar *out, PetscInt stride) const
   {
     const Clock clock(*this, reinterpret_cast<void (*)(void)>(f));
     for (PetscInt q = 0; q < data.fields->points; ++q)
       f(dim, data.fields->n, precomputed_state, data.fields->uOff, data.fields->uOff_x, u(q), u_t(q), u_x(q), nullptr,
-        nullptr, state(q), nullptr, nullptr, t, data.x + q * dim, data.normals + q * dim, nc, constants,
+        data.fields->uOff_x, state(q), nullptr, rate_x(q), t, data.x + q * dim, data.normals + q * dim, nc, constants,
         out + q * stride);
   }
   void operator()(PetscBdPointJac g, PetscScalar *out, PetscInt stride) const
@@ -297,7 +297,7 @@ public:
     const Clock clock(*this, reinterpret_cast<void (*)(void)>(g));
     for (PetscInt q = 0; q < data.fields->points; ++q)
       g(dim, data.fields->n, precomputed_state, data.fields->uOff, data.fields->uOff_x, u(q), u_t(q), u_x(q), nullptr,
-        nullptr, state(q), nullptr, nullptr, t, shift, data.x + q * dim, data.normals + q * dim, nc, constants,
+        data.fields->uOff_x, state(q), nullptr, rate_x(q), t, shift, data.x + q * dim, data.normals + q * dim, nc, constants,
         out + q * stride);
   }
 

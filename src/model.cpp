@@ -458,14 +458,16 @@ PetscErrorCode Model::find_carrier()
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Model::set_step(PetscReal dt, PetscReal airway_pressure, PetscReal airway_flow)
+PetscErrorCode Model::set_step(const Stage &stage, PetscReal airway_pressure, PetscReal airway_flow)
 {
   const PetscReal L = mesh_->length();
 
   PetscFunctionBeginUser;
-  step_ = {dt, airway_pressure, airway_area_ > 0 ? -airway_flow / airway_area_ : 0, step_.load};
+  const PetscReal load = step_.load;
+  step_ = Step(stage, airway_pressure, airway_area_ > 0 ? -airway_flow / airway_area_ : 0);
+  step_.load = load;
   row_scale_[displacement] = 1 / (modulus_ * L * L);
-  if (row_scale_.size() > pressure) row_scale_[pressure] = dt / (L * L * L);
+  if (row_scale_.size() > pressure) row_scale_[pressure] = (stage.slope > 0 ? 1 / stage.slope : stage.dt) / (L * L * L);
   PetscCall(pack_constants());
   PetscFunctionReturn(PETSC_SUCCESS);
 }

@@ -160,7 +160,7 @@ void Sampling::sample(const Element &e, const PetscScalar *x, std::vector<Sample
     Sample &s = samples[q];
     PetscScalar A[9] = {0}, H[9], b[3] = {0, 0, 0};
     for (int d = 0; d < 3; ++d) {
-      s.u[d] = s.grad_p[d] = 0;
+      s.u[d] = s.grad_p[d] = s.u_t[d] = s.grad_p_t[d] = 0;
       s.x[d] = e.v0[d];
       for (int i = 0; i < 3; ++i) s.x[d] += e.J[3 * d + i] * (t.xi[3 * q + i] + 1);
     }
@@ -176,7 +176,7 @@ void Sampling::sample(const Element &e, const PetscScalar *x, std::vector<Sample
       for (int d = 0; d < 3; ++d)
         H[3 * i + d] = A[3 * i] * e.inverse[d] + A[3 * i + 1] * e.inverse[3 + d] + A[3 * i + 2] * e.inverse[6 + d];
     make_point_state(H, nullptr, s.state);
-    s.p = 0;
+    s.p = s.p_t = 0;
     for (PetscInt a = 0; a < corners_; ++a) {
       const PetscScalar value = x[dofs[3 * nodes_ + a]];
       s.p += value * t.p[q * corners_ + a];
@@ -185,6 +185,16 @@ void Sampling::sample(const Element &e, const PetscScalar *x, std::vector<Sample
     for (int d = 0; d < 3; ++d)
       for (int i = 0; i < 3; ++i) s.grad_p[d] += b[i] * e.inverse[3 * i + d];
   }
+}
+
+void Sampling::make_rates(const Sample &before, PetscReal dt, Sample &now)
+{
+  for (int i = 0; i < 9; ++i) now.state.H_rate[i] = (now.state.H[i] - before.state.H[i]) / dt;
+  for (int d = 0; d < 3; ++d) {
+    now.u_t[d] = (now.u[d] - before.u[d]) / dt;
+    now.grad_p_t[d] = (now.grad_p[d] - before.grad_p[d]) / dt;
+  }
+  now.p_t = (now.p - before.p) / dt;
 }
 
 } // namespace pulmo

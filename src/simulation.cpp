@@ -268,12 +268,12 @@ PetscErrorCode Simulation::before_stage(PetscReal t)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-/// Fills rate_ from local_ as the kernels want it: backward Euler's, or the share of the present (TimeScheme).
+/// Fills rate_ from local_.
 PetscErrorCode Simulation::make_rate()
 {
   PetscFunctionBeginUser;
   if (scheme_.multistep()) {
-    PetscCall(VecAXPBY(rate_, scheme_.slope(), 0, local_));
+    PetscCall(scheme_.rate(local_, rate_));
   } else {
     PetscCall(VecWAXPY(rate_, -1, before_, local_));
     PetscCall(VecScale(rate_, scheme_.slope()));
@@ -727,7 +727,7 @@ PetscErrorCode Simulation::report(const SignalRow &row, const Measures &measures
   worst_balance_ = std::max(worst_balance_, std::abs(balance));
   min_J_ = std::min(min_J_, measures.min_J);
   const bool phase_ends = phase_ && same(row.time, phase_->end);
-  const StepReport step{rows_, row, measures, balance, before_, end_, phase_ends};
+  const StepReport step{rows_, row, measures, balance, before_, local_residual_, end_, phase_ends};
   for (Observer *observer : observers_) PetscCall(observer->observe(step));
   PetscFunctionReturn(PETSC_SUCCESS);
 }

@@ -25,8 +25,10 @@ PetscErrorCode TimeScheme::setup(TS ts, Vec like)
   PetscCall(TSGetDM(ts, &dm));
   PetscCall(DMGetNumFields(dm, &fields));
   gas_ = multistep_ && fields > pressure;
+  if (!multistep_) PetscFunctionReturn(PETSC_SUCCESS);
+  for (Past *past : {&last_, &earlier_, &middle_}) PetscCall(VecDuplicate(like, past->state.out()));
   if (!gas_) PetscFunctionReturn(PETSC_SUCCESS);
-  for (VecHandle *v : {&last_.state, &earlier_.state, &last_.gas, &earlier_.gas, &middle_.gas, &zero_, &rest_})
+  for (VecHandle *v : {&last_.gas, &earlier_.gas, &middle_.gas, &zero_, &rest_})
     PetscCall(VecDuplicate(like, v->out()));
   PetscCall(VecZeroEntries(zero_));
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -40,12 +42,13 @@ PetscErrorCode TimeScheme::keep(Model &model, PetscReal t, PetscReal volume, Vec
   PetscFunctionBeginUser;
   past.time = t;
   past.volume = volume;
+  if (multistep_) PetscCall(VecCopy(local, past.state));
   if (!gas_) PetscFunctionReturn(PETSC_SUCCESS);
-  if (past.state) PetscCall(VecCopy(local, past.state));
-  // with dt = 1 s and the state as its own rate the kernels integrate J - 1, and what does not depend on the rate
-  PetscCall(model.set_step(1, 0));
-  PetscCall(model.residual(t, local, local, past.gas));
+  // with a slope of 1/s the kernels integrate J - 1, and what does not depend on it
+  PetscCall(model.set_step({1, 0, true}, 0));
   PetscCall(model.residual(t, local, zero_, rest_));
+  PetscCall(model.set_step({1, 1, true}, 0));
+  PetscCall(model.residual(t, local, zero_, past.gas));
   PetscCall(VecAXPY(past.gas, -1, rest_));
   PetscCall(VecScale(past.gas, 1 / model.row_scale(pressure)));
   PetscCall(DMGetLocalSection(model.dm(), &section));
@@ -83,8 +86,8 @@ PetscErrorCode TimeScheme::persist(Archive &archive, Model &model, PetscReal t, 
     PetscCall(archive.value("time_scheme/time_s", earlier_t));
     PetscCall(archive.value("time_scheme/volume_mm3", earlier_volume));
     PetscCall(VecDuplicate(local, state.out()));
-    if (gas_ && !archive.reading()) PetscCall(VecCopy(earlier_.state, state));
-    if (gas_) PetscCall(archive.local("time_scheme/state", state));
+    if (!archive.reading()) PetscCall(VecCopy(earlier_.state, state));
+    PetscCall(archive.local("time_scheme/state", state));
     resumes_ = archive.reading();
     if (resumes_) PetscCall(keep(model, earlier_t, earlier_volume, state, earlier_));
   }
@@ -114,12 +117,14 @@ PetscErrorCode TimeScheme::begin_stage(PetscReal t, PetscReal dt)
   half_ = multistep_ && ts_->steprestart && t - from < 0.75 * dt;
   used_ = {&last_, nullptr};
   if (!multistep_ || half_) {
-    slope_ = 1 / (multistep_ ? t - from : dt);
+    dt_ = multistep_ ? t - from : dt;
+    slope_ = 1 / dt_;
     weight_ = {-slope_, 0};
     PetscFunctionReturn(PETSC_SUCCESS);
   }
   used_[1] = ts_->steprestart ? &middle_ : &earlier_;
   const PetscReal a = t - from, b = t - used_[1]->time;
+  dt_ = a;
   slope_ = 1 / a + 1 / b;
   weight_ = {-b / (a * (b - a)), a / (b * (b - a))};
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -137,6 +142,15 @@ PetscErrorCode TimeScheme::accept(Model &model, PetscReal t, PetscReal volume, V
   PetscFunctionBeginUser;
   std::swap(last_, earlier_);
   PetscCall(keep(model, t, volume, local, last_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode TimeScheme::rate(Vec now, Vec rate) const
+{
+  PetscFunctionBeginUser;
+  PetscCall(VecAXPBY(rate, slope_, 0, now));
+  for (std::size_t i = 0; i < used_.size(); ++i)
+    if (used_[i]) PetscCall(VecAXPY(rate, weight_[i], used_[i]->state));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

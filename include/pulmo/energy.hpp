@@ -71,7 +71,7 @@ private:
   std::vector<PetscInt> held_; ///< constrained displacement components, offsets in the local vector
   std::vector<EnergyAccount> accounts_;
   std::vector<EnergyBalance> rows_;
-  VecHandle before_, rate_, residual_;
+  VecHandle before_;
   double gas_pressure_ = 0; ///< uniform pressure at the start of the step, kPa
 };
 

@@ -11,7 +11,7 @@ namespace pulmo {
 
 /// The equations of a scene on its mesh.
 ///
-/// Residual rows are made dimensionless: momentum by (modulus x length^2), mass by (length^3 / dt), with the
+/// Residual rows are made dimensionless: momentum by (modulus x length^2), mass by (length^3 slope), with the
 /// tissue's bulk modulus at F = I and the mean cell size. Tolerances then mean the same for a mouse and a man, and
 /// neither field hides behind the other in the norm.
 class Model {
@@ -26,9 +26,9 @@ public:
   const Assembly &assembly() const { return assembly_; }
   bool own_integration() const { return own_; }
 
-  /// Tells the kernels the step at hand: its size (s), the pressure held at the airway (kPa) and the flow into the lung
-  /// that is prescribed while none is held (mm^3/s).
-  PetscErrorCode set_step(PetscReal dt, PetscReal airway_pressure, PetscReal airway_flow = 0);
+  /// Tells the kernels the stage at hand, the pressure held at the airway (kPa) and the flow into the lung that is
+  /// prescribed while none is held (mm^3/s). A slope of 0 leaves the rate of J out.
+  PetscErrorCode set_step(const Stage &stage, PetscReal airway_pressure, PetscReal airway_flow = 0);
   /// Share of the dead loads that is there from the next set_step() on.
   void set_load(PetscReal load) { step_.load = load; }
   PetscReal load() const { return step_.load; }
@@ -131,7 +131,7 @@ private:
   bool closes_rows_ = false, airway_held_ = true;
   PetscInt carrier_ = -1; ///< global dof, -1 on ranks that do not own it
   PetscMPIInt carrier_rank_ = 0;
-  Step step_{1, 0, 0, 1};
+  Step step_;
   PetscReal modulus_ = 1;
   std::vector<PetscReal> row_scale_;
   PetscInt quadrature_degree_ = 3;

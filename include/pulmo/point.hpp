@@ -60,18 +60,36 @@ P get(const PetscScalar c[])
 /// For kernels without parameters of their own.
 struct NoParameters {};
 
+/// How the stage at hand makes rates: u_t = slope u + what the states before it add. Backward Euler: slope = 1 / dt.
+struct Stage {
+  PetscReal dt;           ///< from the last accepted state to the end of the stage, s
+  PetscReal slope;        ///< 1/s
+  bool multistep = false; ///< more than one state before counts (TimeScheme)
+
+  Stage(PetscReal step, PetscReal a, bool several) : dt(step), slope(a), multistep(several) {}
+  /// Backward Euler. Implicit: a step of that scheme is told by its size.
+  Stage(PetscReal step) : dt(step), slope(1 / step) {}
+};
+
 /// What the time step tells every kernel.
 struct Step {
   static constexpr const char *owner = "step";
-  PetscScalar dt;           ///< size of the step, s
-  PetscScalar gas_pressure; ///< pressure held at the airway, kPa
-  PetscScalar airway_flux;  ///< outward flux prescribed at the airway (0 while a pressure is held), mm/s
+  PetscScalar dt = 1;           ///< size of the step, s
+  PetscScalar slope = 1;        ///< d(rate)/d(state), 1/s
+  PetscScalar multistep = 0;    ///< 1: rates hold more than one state before (Stage)
+  PetscScalar gas_pressure = 0; ///< pressure held at the airway, kPa
+  PetscScalar airway_flux = 0;  ///< outward flux prescribed at the airway (0 while a pressure is held), mm/s
   PetscScalar load = 1; ///< share of the dead loads that is there: less than 1 where the first step of a run was cut
+
+  Step() = default;
+  explicit Step(const Stage &stage, PetscScalar gas = 0, PetscScalar flux = 0)
+      : dt(stage.dt), slope(stage.slope), multistep(stage.multistep ? 1 : 0), gas_pressure(gas), airway_flux(flux)
+  {}
 };
 
 /// A quadrature point as a kernel sees it.
 struct Point {
-  const PointState &state;   ///< F, J, rates
+  const PointState &state;   ///< F, J, Grad u_t
   const PetscScalar *u;      ///< displacement, mm
   PetscScalar p = 0;         ///< alveolar pressure, kPa (airflow only)
   const PetscScalar *grad_p; ///< Grad p, kPa/mm (null without airflow)
@@ -80,7 +98,9 @@ struct Point {
   const PetscReal *x;        ///< material coordinates, mm
   const PetscReal *normal;   ///< outward unit normal (surface kernels only)
   Step step;
-  const PetscScalar *grad_p_t = nullptr; ///< Grad p_t, kPa/(mm s) (residual terms of the volume, with airflow)
+  const PetscScalar *u_t = nullptr;      ///< velocity, mm/s
+  PetscScalar p_t = 0;                   ///< kPa/s (airflow only)
+  const PetscScalar *grad_p_t = nullptr; ///< Grad p_t, kPa/(mm s) (null without airflow)
 
   /// Pressure of the gas in the pores: the local field, or the uniform pressure without airflow, kPa.
   PetscScalar gas_pressure() const { return grad_p ? p : step.gas_pressure; }
@@ -94,14 +114,14 @@ namespace detail {
 /// The arguments that all four kinds of callback begin with.
 #define PULMO_POINT_ARGUMENTS                                                                                          \
   PetscInt, PetscInt Nf, PetscInt NfAux, const PetscInt uOff[], const PetscInt uOff_x[], const PetscScalar u[],        \
-      const PetscScalar[], const PetscScalar u_x[], const PetscInt[], const PetscInt aOff_x[], const PetscScalar a[],  \
+      const PetscScalar u_t[], const PetscScalar u_x[], const PetscInt[], const PetscInt aOff_x[], const PetscScalar a[],  \
       const PetscScalar[], const PetscScalar a_x[], PetscReal t
 
 /// The point of a callback. Its kinematic state is handed in by pulmo's integrator, or made here in @p storage
 /// (stock PetscFE, where auxiliary fields of the same discretisation carry u_t and p_t).
 static inline Point make_point(PointState &storage, PetscInt Nf, PetscInt NfAux, const PetscInt uOff[],
-                               const PetscInt uOff_x[], const PetscScalar u[], const PetscScalar u_x[],
-                               const PetscInt aOff_x[], const PetscScalar a[], const PetscScalar a_x[], PetscReal t,
+                               const PetscInt uOff_x[], const PetscScalar u[], const PetscScalar u_t[],
+                               const PetscScalar u_x[], const PetscInt aOff_x[], const PetscScalar a[], const PetscScalar a_x[], PetscReal t,
                                PetscReal shift, const PetscReal x[], const PetscReal normal[], const PetscScalar c[])
 {
   const bool made = NfAux == precomputed_state, gas = Nf > pressure;
@@ -115,6 +135,8 @@ static inline Point make_point(PointState &storage, PetscInt Nf, PetscInt NfAux,
           x,
           normal,
           constants::get<Step>(c),
+          u_t ? u_t + uOff[displacement] : nullptr,
+          gas && u_t ? u_t[uOff[pressure]] : 0,
           gas && a_x && (made || NfAux > pressure) ? a_x + aOff_x[pressure] : nullptr};
 }
 
@@ -128,7 +150,7 @@ template <class P, Kernel<P> K>
 void volume_residual(PULMO_POINT_ARGUMENTS, const PetscReal x[], PetscInt, const PetscScalar c[], PetscScalar f[])
 {
   PointState storage;
-  K(detail::make_point(storage, Nf, NfAux, uOff, uOff_x, u, u_x, aOff_x, a, a_x, t, 0, x, nullptr, c),
+  K(detail::make_point(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_x, t, 0, x, nullptr, c),
     constants::get<P>(c), f);
 }
 
@@ -138,7 +160,7 @@ void volume_jacobian(PULMO_POINT_ARGUMENTS, PetscReal shift, const PetscReal x[]
                      PetscScalar g[])
 {
   PointState storage;
-  K(detail::make_point(storage, Nf, NfAux, uOff, uOff_x, u, u_x, aOff_x, a, a_x, t, shift, x, nullptr, c),
+  K(detail::make_point(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_x, t, shift, x, nullptr, c),
     constants::get<P>(c), g);
 }
 
@@ -148,7 +170,7 @@ void surface_residual(PULMO_POINT_ARGUMENTS, const PetscReal x[], const PetscRea
                       PetscScalar f[])
 {
   PointState storage;
-  K(detail::make_point(storage, Nf, NfAux, uOff, uOff_x, u, u_x, aOff_x, a, a_x, t, 0, x, n, c), constants::get<P>(c),
+  K(detail::make_point(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_x, t, 0, x, n, c), constants::get<P>(c),
     f);
 }
 
@@ -158,14 +180,14 @@ void surface_jacobian(PULMO_POINT_ARGUMENTS, PetscReal shift, const PetscReal x[
                       const PetscScalar c[], PetscScalar g[])
 {
   PointState storage;
-  K(detail::make_point(storage, Nf, NfAux, uOff, uOff_x, u, u_x, aOff_x, a, a_x, t, shift, x, n, c),
+  K(detail::make_point(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_x, t, shift, x, n, c),
     constants::get<P>(c), g);
 }
 
 #undef PULMO_POINT_ARGUMENTS
 
 /// A share of the energy balance of a step, from the state at its end and the one at its start: kPa per reference
-/// volume, kPa mm per reference area.
+/// volume, kPa mm per reference area. Rates are those of @p now.
 template <class P>
 using EnergyKernel = PetscScalar (*)(const Point &now, const Point &before, const P &);
 

@@ -13,6 +13,7 @@ struct Sample {
   PetscScalar u[3];      ///< mm
   PetscScalar p;         ///< kPa (airflow only)
   PetscScalar grad_p[3]; ///< kPa/mm (airflow only)
+  PetscScalar u_t[3], p_t, grad_p_t[3]; ///< rates, as that in the state: of make_rates(), else 0
 };
 
 /// The points of the model's own rules, so that integrals match the weak form term by term.
@@ -37,10 +38,17 @@ public:
   const std::vector<PetscReal> &weights(const Element &element) const { return tables_[element.table].weights; }
   /// States at the points of @p element for the local vector @p x.
   void sample(const Element &element, const PetscScalar *x, std::vector<Sample> &samples) const;
+  /// Gives @p now the rates that backward Euler finds in it after @p before, @p dt seconds earlier.
+  static void make_rates(const Sample &before, PetscReal dt, Sample &now);
   /// A sample as kernels see it.
   Point point(const Sample &sample, const Element &element, PetscReal t, const Step &step) const
   {
-    return {sample.state, sample.u, sample.p, gas_ ? sample.grad_p : nullptr, t, 0, sample.x, element.normal, step};
+    return {sample.state, sample.u,
+            sample.p,     gas_ ? sample.grad_p : nullptr,
+            t,            0,
+            sample.x,     element.normal,
+            step,         sample.u_t,
+            sample.p_t,   gas_ ? sample.grad_p_t : nullptr};
   }
 
 private:

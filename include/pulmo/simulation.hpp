@@ -26,6 +26,7 @@ struct StepReport {
   Measures measures;
   PetscReal mass_balance_error; ///< int (J - 1) less what flowed in, by the time scheme, mm^3
   Vec local;                    ///< state with constrained values in place
+  Vec residual;                 ///< local, rows scaled; not of the row at the start
   PetscReal end;                ///< when the run ends, s
   bool phase_ends;              ///< this row is the last of its phase
 };

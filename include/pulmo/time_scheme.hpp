@@ -15,8 +15,8 @@ namespace pulmo {
 /// -ts_type beuler: y_0 is the state before the step. The kernels make dJ/dt themselves (effects/airflow.hpp).
 ///
 /// -ts_type bdf, order 2: the last two states. After a kink PETSc makes half a step with backward Euler first, and y_1
-/// is the state there. The kernels are asked for slope (J - 1) alone; the past is kept as int (J_i - 1) q, so that gas
-/// is conserved to rounding.
+/// is the state there. Kernels see the rate of the fields itself. That of J is no function of it: they give
+/// slope (J - 1), and the past is kept as int (J_i - 1) q, so that gas is conserved to rounding.
 class TimeScheme {
 public:
   /// Reads the type off @p ts and refuses those whose rate is not conservative here. @p like: a local vector.
@@ -40,6 +40,10 @@ public:
   PetscErrorCode accept(Model &model, PetscReal t, PetscReal volume, Vec local);
 
   PetscReal slope() const { return slope_; } ///< 1/s
+  /// What kernels are told of the stage at hand.
+  Stage stage() const { return {dt_, slope_, multistep_}; }
+  /// Rate of the fields at the local state @p now, constrained values in place.
+  PetscErrorCode rate(Vec now, Vec rate) const;
   /// The share of the past in the rate of volume, mm^3/s.
   PetscReal past_flow() const;
   /// Rate of volume at @p volume, mm^3/s.
@@ -50,7 +54,7 @@ public:
 private:
   struct Past {
     PetscReal time = 0, volume = 0; ///< s, mm^3
-    VecHandle state;                ///< local; a half step's is not kept, as no checkpoint holds it
+    VecHandle state;                ///< local; with more than one state before
     VecHandle gas;                  ///< local: its int (J - 1) q in the mass rows, mm^3
   };
 
@@ -64,7 +68,7 @@ private:
   Past last_, earlier_, middle_;
   std::array<const Past *, 2> used_{};
   std::array<PetscReal, 2> weight_{};
-  PetscReal slope_ = 1;
+  PetscReal dt_ = 1, slope_ = 1;
   VecHandle zero_, rest_; ///< local: zero; for keep()
 };
 

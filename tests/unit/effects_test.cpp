@@ -26,7 +26,7 @@ struct PowerPermeability {
 struct Data {
   Tensor H{}, rate{};
   double u[3]{}, p = 0, grad_p[3]{}, x[3]{}, normal[3]{0, 0, 1};
-  Step step{0.05, 0.4, 0};
+  Step step{0.05, 0.4};
   double shift = 0;
   bool airflow = true;
 

@@ -5,8 +5,9 @@
 ///   momentum: adds  - int J p F^-T : Grad eta
 ///   mass:     int dJ/dt q - int Q . Grad q (+ int Q.N q on the boundary: natural condition, no flux) = 0
 ///   Q = k J F^-1 F^-T (-Grad p)
-/// dJ/dt is exactly conservative: with D = dt Grad u_t, (det F - det(F - D)) / dt, which for backward Euler is
-/// (J^n+1 - J^n) / dt, written out so that nothing cancels.
+/// dJ/dt is exactly conservative. Backward Euler: with D = dt Grad u_t, (det F - det(F - D)) / dt, which is
+/// (J^n+1 - J^n) / dt, written out so that nothing cancels. With more than one state before (BDF2) the kernel gives the
+/// share of the present, slope (J - 1), and TimeScheme adds that of the past.
 #pragma once
 
 #include "pulmo/effect.hpp"
@@ -36,6 +37,10 @@ struct AirflowKernels {
     const PointState &s = point.state;
     const PetscScalar dt = point.step.dt;
     PetscScalar cof_rate[9];
+    if (point.step.multistep) {
+      f0[0] += point.step.slope * s.J_minus_1;
+      return;
+    }
     cofactor(s.H_rate, cof_rate);
     f0[0] += contract(s.cof_F, s.H_rate) - dt * contract(s.F, cof_rate) + dt * dt * determinant(s.H_rate);
   }
@@ -44,6 +49,10 @@ struct AirflowKernels {
     const PointState &s = point.state;
     const PetscScalar dt = point.step.dt, a = point.shift;
     PetscScalar cof_rate[9], cross[9];
+    if (point.step.multistep) {
+      for (int i = 0; i < 9; ++i) g1[i] += a * s.cof_F[i];
+      return;
+    }
     cofactor(s.H_rate, cof_rate);
     tensor_cross(s.F, s.H_rate, cross);
     // d/dF gives cross - dt cof_rate, d/dF' gives cof F - dt cross + dt^2 cof_rate
