@@ -287,7 +287,7 @@ PetscErrorCode ErrorIndicator::estimate(Vec local, CellErrors &errors)
       if (!gas) continue;
       const auto dissipation = [&] {
         const Point point = sampling_.point(s, e, 0, second);
-        return w * scene_.airflow().dissipation()(point, point, constants);
+        return w * scene_.airflow().dissipation().function(point, point, constants);
       };
       whole[1] += dissipation();
       gradient_.evaluate(c, lambda.data(), error);

@@ -297,8 +297,8 @@ public:
     const Clock clock(*this, reinterpret_cast<void (*)(void)>(g));
     for (PetscInt q = 0; q < data.fields->points; ++q)
       g(dim, data.fields->n, precomputed_state, data.fields->uOff, data.fields->uOff_x, u(q), u_t(q), u_x(q), nullptr,
-        data.fields->uOff_x, state(q), nullptr, rate_x(q), t, shift, data.x + q * dim, data.normals + q * dim, nc, constants,
-        out + q * stride);
+        data.fields->uOff_x, state(q), nullptr, rate_x(q), t, shift, data.x + q * dim, data.normals + q * dim, nc,
+        constants, out + q * stride);
   }
 
 private:

@@ -37,6 +37,7 @@ PetscErrorCode Model::build(Composition composition, PetscReal modulus)
   mesh_ = &composition.mesh();
   composition_ = std::make_unique<Composition>(std::move(composition));
   modulus_ = modulus;
+  PetscCall(this->composition().check_parameters(PetscObjectComm((PetscObject)mesh_->dm())));
   PetscCall(DMClone(mesh_->dm(), dm_.out()));
   PetscCall(create_fields());
   PetscCall(create_weak_form());
@@ -469,6 +470,24 @@ PetscErrorCode Model::set_step(const Stage &stage, PetscReal airway_pressure, Pe
   row_scale_[displacement] = 1 / (modulus_ * L * L);
   if (row_scale_.size() > pressure) row_scale_[pressure] = (stage.slope > 0 ? 1 / stage.slope : stage.dt) / (L * L * L);
   PetscCall(pack_constants());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Composition::check_parameters(MPI_Comm comm) const
+{
+  PetscFunctionBeginUser;
+  for (const Reader &reader : readers_) {
+    const auto n = std::count_if(parameters_.begin(), parameters_.end(), [&](const ParameterBlock &block) {
+      return constants::tag(block.owner) == constants::tag(reader.owner);
+    });
+    PetscCheck(n > 0, comm, PETSC_ERR_ARG_WRONGSTATE,
+               "effect %s: '%s' reads the parameters of '%s', which no effect hands over; call "
+               "Composition::parameters in terms()",
+               reader.effect.c_str(), reader.term.c_str(), reader.owner);
+    PetscCheck(n == 1, comm, PETSC_ERR_ARG_WRONGSTATE,
+               "effect %s: the parameters of '%s' are handed over %d times; give each block an owner of its own",
+               reader.effect.c_str(), reader.owner, (int)n);
+  }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -43,6 +43,57 @@ struct Term {
   PetscBdPointJac bd_g0 = nullptr, bd_g1 = nullptr, bd_g2 = nullptr, bd_g3 = nullptr;
 };
 
+/// A callback in its place in a term.
+template <class F, PetscInt Order>
+struct Slot {
+  Callback<F> callback;
+
+  void put(Term &t) const
+  {
+    if constexpr (std::is_same_v<F, PetscPointFunc>)
+      (Order == 0 ? t.f0 : t.f1) = callback.function;
+    else if constexpr (std::is_same_v<F, PetscBdPointFunc>)
+      (Order == 0 ? t.bd_f0 : t.bd_f1) = callback.function;
+    else if constexpr (std::is_same_v<F, PetscPointJac>)
+      (Order == 0 ? t.g0 : Order == 1 ? t.g1 : Order == 2 ? t.g2 : t.g3) = callback.function;
+    else
+      (Order == 0 ? t.bd_g0 : Order == 1 ? t.bd_g1 : Order == 2 ? t.bd_g2 : t.bd_g3) = callback.function;
+  }
+};
+
+// residual: f0 . q + f1 : Grad q; Jacobian: g0 by value and value, g1 by Grad of the trial field, g2 of the test field,
+// g3 of both (pulmo/point.hpp)
+template <class F>
+Slot<F, 0> f0(Callback<F> c)
+{
+  return {c};
+}
+template <class F>
+Slot<F, 1> f1(Callback<F> c)
+{
+  return {c};
+}
+template <class F>
+Slot<F, 0> g0(Callback<F> c)
+{
+  return {c};
+}
+template <class F>
+Slot<F, 1> g1(Callback<F> c)
+{
+  return {c};
+}
+template <class F>
+Slot<F, 2> g2(Callback<F> c)
+{
+  return {c};
+}
+template <class F>
+Slot<F, 3> g3(Callback<F> c)
+{
+  return {c};
+}
+
 /// Prescribed values of some components of a field, on a surface or at single vertices.
 struct Constraint {
   std::string effect, name;
@@ -110,47 +161,36 @@ public:
     parameters_.push_back({owner, data, count});
   }
 
-  void residual(const std::string &name, PetscInt test, PetscPointFunc f0, PetscPointFunc f1)
+  /// A residual term of the volume, e.g. residual("P : Grad eta", displacement, f1(volume_residual<P, K::stress>)).
+  template <class... Slots>
+  void residual(const std::string &name, PetscInt test, Slots... slots)
   {
-    Term t = term(name, "", test, -1);
-    t.f0 = f0;
-    t.f1 = f1;
-    terms_.push_back(t);
+    add(term(name, "", test, -1), slots...);
   }
-  void jacobian(const std::string &name, PetscInt test, PetscInt trial, PetscPointJac g0, PetscPointJac g1,
-                PetscPointJac g2, PetscPointJac g3)
+  /// A Jacobian term of the volume: of the row @p test by the field @p trial.
+  template <class... Slots>
+  void jacobian(const std::string &name, PetscInt test, PetscInt trial, Slots... slots)
   {
-    Term t = term(name, "", test, trial);
-    t.g0 = g0;
-    t.g1 = g1;
-    t.g2 = g2;
-    t.g3 = g3;
-    terms_.push_back(t);
+    add(term(name, "", test, trial), slots...);
   }
-  void surface_residual(const std::string &name, const std::string &surface, PetscInt test, PetscBdPointFunc f0,
-                        PetscBdPointFunc f1)
+  template <class... Slots>
+  void surface_residual(const std::string &name, const std::string &surface, PetscInt test, Slots... slots)
   {
-    Term t = term(name, surface, test, -1);
-    t.bd_f0 = f0;
-    t.bd_f1 = f1;
-    terms_.push_back(t);
+    add(term(name, surface, test, -1), slots...);
   }
+  template <class... Slots>
   void surface_jacobian(const std::string &name, const std::string &surface, PetscInt test, PetscInt trial,
-                        PetscBdPointJac g0, PetscBdPointJac g1, PetscBdPointJac g2, PetscBdPointJac g3)
+                        Slots... slots)
   {
-    Term t = term(name, surface, test, trial);
-    t.bd_g0 = g0;
-    t.bd_g1 = g1;
-    t.bd_g2 = g2;
-    t.bd_g3 = g3;
-    terms_.push_back(t);
+    add(term(name, surface, test, trial), slots...);
   }
   /// A term of the energy balance: work done on the lung in a step (external), growth of a stored energy, energy
   /// turned to heat (dissipated), and what backward Euler loses beside these: work of the term's force at the end of
   /// the step along the step, less what is stored (numerical).
-  void energy(Energy kind, const std::string &account, const std::string &surface, EnergyDensity density)
+  void energy(Energy kind, const std::string &account, const std::string &surface, Callback<EnergyDensity> density)
   {
-    energies_.push_back({effect_, kind, account, surface, density});
+    energies_.push_back({effect_, kind, account, surface, density.function});
+    if (density.owner) readers_.push_back({effect_, account, density.owner});
   }
   void constrain(Constraint c)
   {
@@ -203,6 +243,8 @@ public:
   const std::vector<Constraint> &constraints() const { return constraints_; }
   const std::vector<EnergyTerm> &energies() const { return energies_; }
   const std::vector<ParameterBlock> &parameter_blocks() const { return parameters_; }
+  /// Refuses terms that read parameters which no effect hands over, or two hand over: an error in an effect's code.
+  PetscErrorCode check_parameters(MPI_Comm comm) const;
   /// Constants of PetscDS for a step: those of the step and of all effects, under a directory.
   std::vector<PetscScalar> constants(const Step &step) const;
 
@@ -220,6 +262,24 @@ private:
     return t;
   }
 
+  template <class... Slots>
+  void add(Term t, Slots... slots)
+  {
+    const auto fill = [&](const auto &slot) {
+      slot.put(t);
+      if (slot.callback.owner) readers_.push_back({t.effect, t.name, slot.callback.owner});
+    };
+    static_assert(sizeof...(Slots) > 0, "a term needs a callback: f0(...), f1(...), g0(...) ... g3(...)");
+    (fill(slots), ...);
+    terms_.push_back(std::move(t));
+  }
+
+  /// What reads a block of parameters.
+  struct Reader {
+    std::string effect, term;
+    const char *owner;
+  };
+
   const Mesh &mesh_;
   Elements elements_;
   std::string effect_, pins_for_;
@@ -229,6 +289,7 @@ private:
   std::vector<Constraint> constraints_;
   std::vector<EnergyTerm> energies_;
   std::vector<ParameterBlock> parameters_;
+  std::vector<Reader> readers_;
 };
 
 /// Pressure lost between ventilator and airway, after Rohrer: K1 Q + K2 |Q| Q with the flow Q in mm^3/s.

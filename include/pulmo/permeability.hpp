@@ -47,10 +47,10 @@ public:
   virtual PetscErrorCode declare(Options &options) = 0;
   virtual const PetscScalar *parameters(PetscInt *count) const = 0;
   virtual PetscReal at_rest() const = 0; ///< k at J = 1, mm^2/(kPa s)
-  virtual PetscPointFunc flux_callback() const = 0;
-  virtual PetscPointJac flux_by_displacement_callback() const = 0;
-  virtual PetscPointJac flux_by_pressure_callback() const = 0;
-  virtual EnergyDensity dissipation_callback() const = 0;
+  virtual Callback<PetscPointFunc> flux_callback() const = 0;
+  virtual Callback<PetscPointJac> flux_by_displacement_callback() const = 0;
+  virtual Callback<PetscPointJac> flux_by_pressure_callback() const = 0;
+  virtual Callback<EnergyDensity> dissipation_callback() const = 0;
 };
 
 template <class Law>
@@ -67,16 +67,19 @@ public:
     return reinterpret_cast<const PetscScalar *>(&parameters_);
   }
   PetscReal at_rest() const override { return Law::permeability(1, parameters_).k; }
-  PetscPointFunc flux_callback() const override { return volume_residual<Parameters, Kernels::flux>; }
-  PetscPointJac flux_by_displacement_callback() const override
+  Callback<PetscPointFunc> flux_callback() const override { return volume_residual<Parameters, Kernels::flux>; }
+  Callback<PetscPointJac> flux_by_displacement_callback() const override
   {
     return volume_jacobian<Parameters, Kernels::flux_by_displacement>;
   }
-  PetscPointJac flux_by_pressure_callback() const override
+  Callback<PetscPointJac> flux_by_pressure_callback() const override
   {
     return volume_jacobian<Parameters, Kernels::flux_by_pressure>;
   }
-  EnergyDensity dissipation_callback() const override { return energy_density<Parameters, Kernels::dissipation>; }
+  Callback<EnergyDensity> dissipation_callback() const override
+  {
+    return energy_density<Parameters, Kernels::dissipation>;
+  }
 
 private:
   Parameters parameters_;

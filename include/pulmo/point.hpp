@@ -109,20 +109,24 @@ struct Point {
 /// NfAux that says: the auxiliary array is a PointState made by pulmo's integrator, its gradients those of the rates.
 constexpr PetscInt precomputed_state = -1;
 
+template <class P>
+using Kernel = void (*)(const Point &, const P &, PetscScalar[]);
+
 namespace detail {
 
 /// The arguments that all four kinds of callback begin with.
 #define PULMO_POINT_ARGUMENTS                                                                                          \
   PetscInt, PetscInt Nf, PetscInt NfAux, const PetscInt uOff[], const PetscInt uOff_x[], const PetscScalar u[],        \
-      const PetscScalar u_t[], const PetscScalar u_x[], const PetscInt[], const PetscInt aOff_x[], const PetscScalar a[],  \
-      const PetscScalar[], const PetscScalar a_x[], PetscReal t
+      const PetscScalar u_t[], const PetscScalar u_x[], const PetscInt[], const PetscInt aOff_x[],                     \
+      const PetscScalar a[], const PetscScalar[], const PetscScalar a_x[], PetscReal t
 
 /// The point of a callback. Its kinematic state is handed in by pulmo's integrator, or made here in @p storage
 /// (stock PetscFE, where auxiliary fields of the same discretisation carry u_t and p_t).
 static inline Point make_point(PointState &storage, PetscInt Nf, PetscInt NfAux, const PetscInt uOff[],
                                const PetscInt uOff_x[], const PetscScalar u[], const PetscScalar u_t[],
-                               const PetscScalar u_x[], const PetscInt aOff_x[], const PetscScalar a[], const PetscScalar a_x[], PetscReal t,
-                               PetscReal shift, const PetscReal x[], const PetscReal normal[], const PetscScalar c[])
+                               const PetscScalar u_x[], const PetscInt aOff_x[], const PetscScalar a[],
+                               const PetscScalar a_x[], PetscReal t, PetscReal shift, const PetscReal x[],
+                               const PetscReal normal[], const PetscScalar c[])
 {
   const bool made = NfAux == precomputed_state, gas = Nf > pressure;
   if (!made) make_point_state(u_x + uOff_x[displacement], NfAux > 0 ? a_x + aOff_x[displacement] : nullptr, storage);
@@ -140,51 +144,69 @@ static inline Point make_point(PointState &storage, PetscInt Nf, PetscInt NfAux,
           gas && a_x && (made || NfAux > pressure) ? a_x + aOff_x[pressure] : nullptr};
 }
 
-} // namespace detail
-
-template <class P>
-using Kernel = void (*)(const Point &, const P &, PetscScalar[]);
-
-/// Callback of a volume residual term (f0 or f1).
 template <class P, Kernel<P> K>
 void volume_residual(PULMO_POINT_ARGUMENTS, const PetscReal x[], PetscInt, const PetscScalar c[], PetscScalar f[])
 {
   PointState storage;
-  K(detail::make_point(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_x, t, 0, x, nullptr, c),
+  K(make_point(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_x, t, 0, x, nullptr, c),
     constants::get<P>(c), f);
 }
 
-/// Callback of a volume Jacobian term (g0 ... g3).
 template <class P, Kernel<P> K>
 void volume_jacobian(PULMO_POINT_ARGUMENTS, PetscReal shift, const PetscReal x[], PetscInt, const PetscScalar c[],
                      PetscScalar g[])
 {
   PointState storage;
-  K(detail::make_point(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_x, t, shift, x, nullptr, c),
+  K(make_point(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_x, t, shift, x, nullptr, c),
     constants::get<P>(c), g);
 }
 
-/// Callback of a surface residual term.
 template <class P, Kernel<P> K>
 void surface_residual(PULMO_POINT_ARGUMENTS, const PetscReal x[], const PetscReal n[], PetscInt, const PetscScalar c[],
                       PetscScalar f[])
 {
   PointState storage;
-  K(detail::make_point(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_x, t, 0, x, n, c), constants::get<P>(c),
-    f);
+  K(make_point(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_x, t, 0, x, n, c), constants::get<P>(c), f);
 }
 
-/// Callback of a surface Jacobian term.
 template <class P, Kernel<P> K>
 void surface_jacobian(PULMO_POINT_ARGUMENTS, PetscReal shift, const PetscReal x[], const PetscReal n[], PetscInt,
                       const PetscScalar c[], PetscScalar g[])
 {
   PointState storage;
-  K(detail::make_point(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_x, t, shift, x, n, c),
-    constants::get<P>(c), g);
+  K(make_point(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_x, t, shift, x, n, c), constants::get<P>(c),
+    g);
 }
 
+} // namespace detail
+
 #undef PULMO_POINT_ARGUMENTS
+
+/// A callback and the owner of the parameters that it reads (null: it reads none).
+template <class F>
+struct Callback {
+  F function = nullptr;
+  const char *owner = nullptr;
+};
+
+template <class P>
+constexpr const char *owner_of()
+{
+  if constexpr (std::is_empty_v<P>)
+    return nullptr;
+  else
+    return P::owner;
+}
+
+// The callback of a kernel: residual terms (f0, f1) and Jacobian terms (g0 ... g3) of the volume and of surfaces.
+template <class P, Kernel<P> K>
+constexpr Callback<PetscPointFunc> volume_residual{detail::volume_residual<P, K>, owner_of<P>()};
+template <class P, Kernel<P> K>
+constexpr Callback<PetscPointJac> volume_jacobian{detail::volume_jacobian<P, K>, owner_of<P>()};
+template <class P, Kernel<P> K>
+constexpr Callback<PetscBdPointFunc> surface_residual{detail::surface_residual<P, K>, owner_of<P>()};
+template <class P, Kernel<P> K>
+constexpr Callback<PetscBdPointJac> surface_jacobian{detail::surface_jacobian<P, K>, owner_of<P>()};
 
 /// A share of the energy balance of a step, from the state at its end and the one at its start: kPa per reference
 /// volume, kPa mm per reference area. Rates are those of @p now.
@@ -194,11 +216,18 @@ using EnergyKernel = PetscScalar (*)(const Point &now, const Point &before, cons
 /// The same as the energy audit calls it.
 using EnergyDensity = PetscScalar (*)(const Point &now, const Point &before, const PetscScalar constants[]);
 
-/// Callback of an energy kernel.
+namespace detail {
+
 template <class P, EnergyKernel<P> K>
 PetscScalar energy_density(const Point &now, const Point &before, const PetscScalar c[])
 {
   return K(now, before, constants::get<P>(c));
 }
+
+} // namespace detail
+
+/// Callback of an energy kernel.
+template <class P, EnergyKernel<P> K>
+constexpr Callback<EnergyDensity> energy_density{detail::energy_density<P, K>, owner_of<P>()};
 
 } // namespace pulmo

@@ -9,10 +9,10 @@ namespace pulmo {
 /// A state at one point.
 struct Sample {
   PointState state;
-  PetscReal x[3];        ///< material coordinates, mm
-  PetscScalar u[3];      ///< mm
-  PetscScalar p;         ///< kPa (airflow only)
-  PetscScalar grad_p[3]; ///< kPa/mm (airflow only)
+  PetscReal x[3];                       ///< material coordinates, mm
+  PetscScalar u[3];                     ///< mm
+  PetscScalar p;                        ///< kPa (airflow only)
+  PetscScalar grad_p[3];                ///< kPa/mm (airflow only)
   PetscScalar u_t[3], p_t, grad_p_t[3]; ///< rates, as that in the state: of make_rates(), else 0
 };
 
@@ -43,12 +43,8 @@ public:
   /// A sample as kernels see it.
   Point point(const Sample &sample, const Element &element, PetscReal t, const Step &step) const
   {
-    return {sample.state, sample.u,
-            sample.p,     gas_ ? sample.grad_p : nullptr,
-            t,            0,
-            sample.x,     element.normal,
-            step,         sample.u_t,
-            sample.p_t,   gas_ ? sample.grad_p_t : nullptr};
+    return {sample.state, sample.u,   sample.p,   gas_ ? sample.grad_p : nullptr,  t, 0, sample.x, element.normal,
+            step,         sample.u_t, sample.p_t, gas_ ? sample.grad_p_t : nullptr};
   }
 
 private:

@@ -182,10 +182,10 @@ public:
   virtual const char *source() const = 0;
   virtual PetscErrorCode declare(Options &options) = 0;
   virtual const PetscScalar *parameters(PetscInt *count) const = 0;
-  virtual PetscPointFunc stress_callback() const = 0;
-  virtual PetscPointJac tangent_callback() const = 0;
-  virtual EnergyDensity stored_callback() const = 0;
-  virtual EnergyDensity numerical_callback() const = 0;
+  virtual Callback<PetscPointFunc> stress_callback() const = 0;
+  virtual Callback<PetscPointJac> tangent_callback() const = 0;
+  virtual Callback<EnergyDensity> stored_callback() const = 0;
+  virtual Callback<EnergyDensity> numerical_callback() const = 0;
   /// Strain energy density W at a state, kPa.
   virtual PetscScalar energy(const PointState &state) const = 0;
   /// P' = dW/dF at a state, kPa.
@@ -209,10 +209,10 @@ public:
     *count = sizeof(Parameters) / sizeof(PetscScalar);
     return reinterpret_cast<const PetscScalar *>(&parameters_);
   }
-  PetscPointFunc stress_callback() const override { return volume_residual<Parameters, Kernels::stress>; }
-  PetscPointJac tangent_callback() const override { return volume_jacobian<Parameters, Kernels::tangent>; }
-  EnergyDensity stored_callback() const override { return energy_density<Parameters, Kernels::stored>; }
-  EnergyDensity numerical_callback() const override { return energy_density<Parameters, Kernels::numerical>; }
+  Callback<PetscPointFunc> stress_callback() const override { return volume_residual<Parameters, Kernels::stress>; }
+  Callback<PetscPointJac> tangent_callback() const override { return volume_jacobian<Parameters, Kernels::tangent>; }
+  Callback<EnergyDensity> stored_callback() const override { return energy_density<Parameters, Kernels::stored>; }
+  Callback<EnergyDensity> numerical_callback() const override { return energy_density<Parameters, Kernels::numerical>; }
   PetscScalar energy(const PointState &state) const override { return Kernels::energy(state, parameters_); }
   void stress(const PointState &state, PetscScalar P[9]) const override
   {

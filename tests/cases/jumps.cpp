@@ -61,12 +61,10 @@ public:
   {
     using P = Jump::Parameters;
     c.parameters(parameters_);
-    c.residual("flux beyond", pressure, nullptr, volume_residual<P, Jump::flux>);
-    c.jacobian("flux beyond", pressure, pressure, nullptr, nullptr, nullptr,
-               volume_jacobian<P, Jump::flux_by_pressure>);
-    c.residual("stress beyond", displacement, nullptr, volume_residual<P, Jump::stress>);
-    c.jacobian("stress beyond", displacement, displacement, nullptr, nullptr, nullptr,
-               volume_jacobian<P, Jump::stress_by_displacement>);
+    c.residual("flux beyond", pressure, f1(volume_residual<P, Jump::flux>));
+    c.jacobian("flux beyond", pressure, pressure, g3(volume_jacobian<P, Jump::flux_by_pressure>));
+    c.residual("stress beyond", displacement, f1(volume_residual<P, Jump::stress>));
+    c.jacobian("stress beyond", displacement, displacement, g3(volume_jacobian<P, Jump::stress_by_displacement>));
     return PETSC_SUCCESS;
   }
 

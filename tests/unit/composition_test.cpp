@@ -540,5 +540,50 @@ TEST(Measure, StatesThatAreNotNumbersAreNotPositive)
   }
 }
 
+/// A load whose parameters are handed over as often as the test says.
+class Careless final : public Effect {
+public:
+  struct Parameters {
+    static constexpr const char *owner = "test_careless";
+    PetscScalar force = 1;
+  };
+  explicit Careless(int times) : times_(times) {}
+  const char *name() const override { return "test_careless"; }
+  const char *about() const override { return "load of a careless author (test)"; }
+  PetscErrorCode declare(Options &options) override
+  {
+    options.group(name(), about());
+    return PETSC_SUCCESS;
+  }
+  bool active() const override { return true; }
+  PetscErrorCode terms(Composition &c, const SceneFacts &) const override
+  {
+    for (int i = 0; i < times_; ++i) c.parameters(parameters_);
+    c.residual("-f . eta", displacement, f0(volume_residual<Parameters, push>));
+    return PETSC_SUCCESS;
+  }
+
+private:
+  static void push(const Point &, const Parameters &k, PetscScalar f[]) { f[0] -= k.force; }
+
+  int times_;
+  Parameters parameters_;
+};
+
+TEST(Composition, ParametersAreHandedOverOnce)
+{
+  for (int times : {0, 1, 2}) {
+    Registry registry = Registry::standard();
+    registry.effect([=] { return std::make_unique<Careless>(times); });
+    SceneRun run(registry);
+    PULMO_OK(set_options(SceneSpec().options()));
+    PULMO_OK(run.declare());
+    PULMO_OK(PetscPushErrorHandler(PetscIgnoreErrorHandler, nullptr));
+    const PetscErrorCode code = run.setup();
+    PULMO_OK(PetscPopErrorHandler());
+    EXPECT_EQ(static_cast<int>(code), times == 1 ? 0 : PETSC_ERR_ARG_WRONGSTATE) << times;
+  }
+}
+
 } // namespace
 } // namespace pulmo::test

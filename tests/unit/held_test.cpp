@@ -151,7 +151,7 @@ TEST_F(Foreign, TermsAndConstraintsTakePart)
   Composition composition(mesh_, elements_);
   std::vector<HeldBody> held;
   composition.field("displacement", 3, 2, "mm");
-  composition.jacobian("foundation", displacement, displacement, foundation, nullptr, nullptr, nullptr);
+  composition.jacobian("foundation", displacement, displacement, g0(Callback<PetscPointJac>{foundation}));
   PULMO_OK(find_held(composition, held));
   EXPECT_EQ(describe(held[0], held[0].free), "translation along z");
   // K int r^2 dx over the cube, on the lever R^2 = 3/4 side^2; the turn about x meets the foundation in y alone

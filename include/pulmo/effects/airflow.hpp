@@ -130,7 +130,7 @@ public:
   /// Permeability over viscosity of the tissue at rest, mm^2/(kPa s).
   PetscReal permeability_at_rest() const { return laws_[chosen_]->at_rest(); }
   /// Heat of the flow in a step, by point: quadratic in Grad p, kPa.
-  EnergyDensity dissipation() const { return laws_[chosen_]->dissipation_callback(); }
+  Callback<EnergyDensity> dissipation() const { return laws_[chosen_]->dissipation_callback(); }
 
   PetscErrorCode declare(Options &options) override
   {
@@ -184,17 +184,14 @@ public:
     PetscFunctionBeginUser;
     const PetscScalar *permeability = darcy.parameters(&count);
     c.parameters("permeability", permeability, count);
-    c.residual("-J p F^-T : Grad eta", displacement, nullptr, volume_residual<P, K::gas_stress>);
-    c.residual("dJ/dt q", pressure, volume_residual<P, K::porosity_rate>, nullptr);
-    c.residual("-Q . Grad q", pressure, nullptr, darcy.flux_callback());
-    c.jacobian("gas stress", displacement, displacement, nullptr, nullptr, nullptr,
-               volume_jacobian<P, K::gas_stress_by_displacement>);
-    c.jacobian("gas stress", displacement, pressure, nullptr, nullptr, volume_jacobian<P, K::gas_stress_by_pressure>,
-               nullptr);
-    c.jacobian("porosity rate", pressure, displacement, nullptr, volume_jacobian<P, K::porosity_rate_by_displacement>,
-               nullptr, nullptr);
-    c.jacobian("flux", pressure, displacement, nullptr, nullptr, nullptr, darcy.flux_by_displacement_callback());
-    c.jacobian("flux", pressure, pressure, nullptr, nullptr, nullptr, darcy.flux_by_pressure_callback());
+    c.residual("-J p F^-T : Grad eta", displacement, f1(volume_residual<P, K::gas_stress>));
+    c.residual("dJ/dt q", pressure, f0(volume_residual<P, K::porosity_rate>));
+    c.residual("-Q . Grad q", pressure, f1(darcy.flux_callback()));
+    c.jacobian("gas stress", displacement, displacement, g3(volume_jacobian<P, K::gas_stress_by_displacement>));
+    c.jacobian("gas stress", displacement, pressure, g2(volume_jacobian<P, K::gas_stress_by_pressure>));
+    c.jacobian("porosity rate", pressure, displacement, g1(volume_jacobian<P, K::porosity_rate_by_displacement>));
+    c.jacobian("flux", pressure, displacement, g3(darcy.flux_by_displacement_callback()));
+    c.jacobian("flux", pressure, pressure, g3(darcy.flux_by_pressure_callback()));
     c.energy(Energy::dissipated, "resistive", "", dissipation());
     c.energy(Energy::numerical, "numerical_dissipation", "", energy_density<P, numerical_gas_loss>);
     for (const std::string &surface : surfaces_) {

@@ -71,22 +71,22 @@ struct ChestWallKernels {
 
   /// The callbacks of each surface, so that a kernel knows its stiffness.
   template <std::size_t... I>
-  static constexpr std::array<PetscBdPointFunc, sizeof...(I)> residuals(std::index_sequence<I...>)
+  static constexpr std::array<Callback<PetscBdPointFunc>, sizeof...(I)> residuals(std::index_sequence<I...>)
   {
     return {surface_residual<Parameters, spring<I>>...};
   }
   template <std::size_t... I>
-  static constexpr std::array<PetscBdPointJac, sizeof...(I)> jacobians(std::index_sequence<I...>)
+  static constexpr std::array<Callback<PetscBdPointJac>, sizeof...(I)> jacobians(std::index_sequence<I...>)
   {
     return {surface_jacobian<Parameters, spring_tangent<I>>...};
   }
   template <std::size_t... I>
-  static constexpr std::array<EnergyDensity, sizeof...(I)> stored_energies(std::index_sequence<I...>)
+  static constexpr std::array<Callback<EnergyDensity>, sizeof...(I)> stored_energies(std::index_sequence<I...>)
   {
     return {energy_density<Parameters, stored<I>>...};
   }
   template <std::size_t... I>
-  static constexpr std::array<EnergyDensity, sizeof...(I)> numerical_losses(std::index_sequence<I...>)
+  static constexpr std::array<Callback<EnergyDensity>, sizeof...(I)> numerical_losses(std::index_sequence<I...>)
   {
     return {energy_density<Parameters, numerical<I>>...};
   }
@@ -142,8 +142,8 @@ public:
     c.parameters(parameters_);
     for (std::size_t i = 0; i < surfaces_.size(); ++i) {
       if (parameters_.stiffness[i] == 0) continue;
-      c.surface_residual("K_s u . eta", surfaces_[i], displacement, residuals[i], nullptr);
-      c.surface_jacobian("K_s", surfaces_[i], displacement, displacement, jacobians[i], nullptr, nullptr, nullptr);
+      c.surface_residual("K_s u . eta", surfaces_[i], displacement, f0(residuals[i]));
+      c.surface_jacobian("K_s", surfaces_[i], displacement, displacement, g0(jacobians[i]));
       c.energy(Energy::stored, "elastic_springs", surfaces_[i], stored[i]);
       c.energy(Energy::numerical, "numerical_dissipation", surfaces_[i], numerical[i]);
     }

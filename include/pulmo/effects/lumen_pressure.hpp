@@ -109,12 +109,12 @@ public:
 
     PetscFunctionBeginUser;
     for (const std::string &surface : surfaces_) {
-      c.surface_residual("p cof F N . eta", surface, displacement, surface_residual<P, K::wall>, nullptr);
-      c.surface_jacobian("wall pressure", surface, displacement, displacement, nullptr,
-                         surface_jacobian<P, K::wall_by_displacement>, nullptr, nullptr);
+      c.surface_residual("p cof F N . eta", surface, displacement, f0(surface_residual<P, K::wall>));
+      c.surface_jacobian("wall pressure", surface, displacement, displacement,
+                         g1(surface_jacobian<P, K::wall_by_displacement>));
       if (facts.airflow)
-        c.surface_jacobian("wall pressure", surface, displacement, pressure, surface_jacobian<P, K::wall_by_pressure>,
-                           nullptr, nullptr, nullptr);
+        c.surface_jacobian("wall pressure", surface, displacement, pressure,
+                           g0(surface_jacobian<P, K::wall_by_pressure>));
       c.energy(Energy::external, "external", surface, energy_density<P, K::work>);
     }
     PetscFunctionReturn(PETSC_SUCCESS);

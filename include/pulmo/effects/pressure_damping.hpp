@@ -79,8 +79,8 @@ public:
 
     PetscFunctionBeginUser;
     c.parameters(parameters_);
-    c.residual("h^2/(c M) Grad p_t . Grad q", pressure, nullptr, volume_residual<P, K::flux>);
-    c.jacobian("damping", pressure, pressure, nullptr, nullptr, nullptr, volume_jacobian<P, K::flux_by_pressure>);
+    c.residual("h^2/(c M) Grad p_t . Grad q", pressure, f1(volume_residual<P, K::flux>));
+    c.jacobian("damping", pressure, pressure, g3(volume_jacobian<P, K::flux_by_pressure>));
     c.energy(Energy::numerical, "numerical_dissipation", "", energy_density<P, K::loss>);
     PetscFunctionReturn(PETSC_SUCCESS);
   }

@@ -50,8 +50,8 @@ public:
 
     PetscFunctionBeginUser;
     c.parameters(name(), parameters, count);
-    c.residual("P' : Grad eta", displacement, nullptr, law().stress_callback());
-    c.jacobian("dP'/dF", displacement, displacement, nullptr, nullptr, nullptr, law().tangent_callback());
+    c.residual("P' : Grad eta", displacement, f1(law().stress_callback()));
+    c.jacobian("dP'/dF", displacement, displacement, g3(law().tangent_callback()));
     c.energy(Energy::stored, "elastic_tissue", "", law().stored_callback());
     c.energy(Energy::numerical, "numerical_dissipation", "", law().numerical_callback());
     PetscFunctionReturn(PETSC_SUCCESS);

@@ -36,12 +36,12 @@ struct TractionKernels {
   }
 
   template <std::size_t... I>
-  static constexpr std::array<PetscBdPointFunc, sizeof...(I)> residuals(std::index_sequence<I...>)
+  static constexpr std::array<Callback<PetscBdPointFunc>, sizeof...(I)> residuals(std::index_sequence<I...>)
   {
     return {surface_residual<Parameters, load<I>>...};
   }
   template <std::size_t... I>
-  static constexpr std::array<EnergyDensity, sizeof...(I)> works(std::index_sequence<I...>)
+  static constexpr std::array<Callback<EnergyDensity>, sizeof...(I)> works(std::index_sequence<I...>)
   {
     return {energy_density<Parameters, work<I>>...};
   }
@@ -91,7 +91,7 @@ public:
     PetscFunctionBeginUser;
     c.parameters(parameters_);
     for (std::size_t i = 0; i < surfaces_.size(); ++i) {
-      c.surface_residual("-T . eta", surfaces_[i], displacement, residuals[i], nullptr);
+      c.surface_residual("-T . eta", surfaces_[i], displacement, f0(residuals[i]));
       c.energy(Energy::external, "external", surfaces_[i], works[i]);
     }
     PetscFunctionReturn(PETSC_SUCCESS);

@@ -133,15 +133,14 @@ public:
 
     PetscFunctionBeginUser;
     if (!facts.airflow) {
-      c.residual("-J p F^-T : Grad eta", displacement, nullptr, volume_residual<P, K::gas_stress>);
-      c.jacobian("gas stress", displacement, displacement, nullptr, nullptr, nullptr,
-                 volume_jacobian<P, K::gas_stress_by_displacement>);
+      c.residual("-J p F^-T : Grad eta", displacement, f1(volume_residual<P, K::gas_stress>));
+      c.jacobian("gas stress", displacement, displacement, g3(volume_jacobian<P, K::gas_stress_by_displacement>));
       if (facts.common_pressure()) c.solve_for_gas_pressure();
       c.energy(Energy::numerical, "numerical_dissipation", "", energy_density<P, numerical_gas_loss>);
     }
     if (facts.free_airway())
       for (const std::string &surface : facts.airway_surfaces)
-        c.surface_residual("Q.N q", surface, pressure, surface_residual<P, AirwayFluxKernels::flux>, nullptr);
+        c.surface_residual("Q.N q", surface, pressure, f0(surface_residual<P, AirwayFluxKernels::flux>));
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 

@@ -19,7 +19,7 @@ public:
   const char *about() const override { return "normal load (verification)"; }
   PetscErrorCode terms(Composition &c, const SceneFacts &) const override
   {
-    c.surface_residual("load N", "side", displacement, surface_residual<NoParameters, press>, nullptr);
+    c.surface_residual("load N", "side", displacement, f0(surface_residual<NoParameters, press>));
     return PETSC_SUCCESS;
   }
 
@@ -59,9 +59,9 @@ void ball(Load kind, const SmallStrain &k, const Series &series, int n, int step
   if (kind == Load::surface) registry.effect<PressedSurface>();
   pulmo::Run run(registry);
   bool finished = false;
-  const std::string gas =
-      " -lumen_pressure off -ventilator pcv -ventilator_ramp 0 -ventilator_inspiration 1 -mesh_scale 1 -ventilator_pip " +
-      column::number(load / units::kPa_per_cmH2O);
+  const std::string gas = " -lumen_pressure off -ventilator pcv -ventilator_ramp 0 -ventilator_inspiration 1 "
+                          "-mesh_scale 1 -ventilator_pip " +
+                          column::number(load / units::kPa_per_cmH2O);
   PULMO_OK(prepare(run, consolidation(k, mesh.path(), "side", t_end / steps, t_end) +
                             " -support -support_surfaces x0,y0,z0 -support_components_x0 x -support_components_y0 y"
                             " -support_components_z0 z" +

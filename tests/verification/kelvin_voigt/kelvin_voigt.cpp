@@ -55,10 +55,9 @@ public:
     using K = DashpotKernels;
     using P = K::Parameters;
     c.parameters(parameters_);
-    c.residual("eta Grad u_t : Grad w", displacement, nullptr, volume_residual<P, K::stress>);
-    c.jacobian("dashpot", displacement, displacement, nullptr, nullptr, nullptr,
-               volume_jacobian<P, K::stress_by_displacement>);
-    c.surface_residual("-T . w", "x1", displacement, surface_residual<P, K::pull>, nullptr);
+    c.residual("eta Grad u_t : Grad w", displacement, f1(volume_residual<P, K::stress>));
+    c.jacobian("dashpot", displacement, displacement, g3(volume_jacobian<P, K::stress_by_displacement>));
+    c.surface_residual("-T . w", "x1", displacement, f0(surface_residual<P, K::pull>));
     c.energy(Energy::dissipated, "dashpot", "", energy_density<P, K::heat>);
     return PETSC_SUCCESS;
   }

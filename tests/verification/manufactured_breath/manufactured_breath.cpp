@@ -50,15 +50,13 @@ public:
   {
     using S = mms::Sources<Law, Breath>;
     using P = NoParameters;
-    c.residual("body force", displacement, volume_residual<P, S::body_force>, nullptr);
-    c.residual("mass source", pressure, volume_residual<P, S::mass_source_rate>, nullptr);
-    c.surface_residual("traction", "x1", displacement, surface_residual<P, S::template traction<S::Wall::sprung>>,
-                       nullptr);
+    c.residual("body force", displacement, f0(volume_residual<P, S::body_force>));
+    c.residual("mass source", pressure, f0(volume_residual<P, S::mass_source_rate>));
+    c.surface_residual("traction", "x1", displacement, f0(surface_residual<P, S::template traction<S::Wall::sprung>>));
     for (const char *face : {"y1", "z0", "z1"})
-      c.surface_residual("traction", face, displacement, surface_residual<P, S::template traction<S::Wall::plain>>,
-                         nullptr);
+      c.surface_residual("traction", face, displacement, f0(surface_residual<P, S::template traction<S::Wall::plain>>));
     for (const char *face : {"x0", "y0", "y1", "z0", "z1"})
-      c.surface_residual("outflow", face, pressure, surface_residual<P, S::outflow>, nullptr);
+      c.surface_residual("outflow", face, pressure, f0(surface_residual<P, S::outflow>));
     return PETSC_SUCCESS;
   }
 };

@@ -37,21 +37,19 @@ public:
     using P = NoParameters;
     using Wall = typename S::Wall;
     if (weak_) {
-      c.residual("exact stress", displacement, nullptr, volume_residual<P, S::stress>);
-      c.residual("exact rate and flux", pressure, volume_residual<P, S::rate>, volume_residual<P, S::flux>);
+      c.residual("exact stress", displacement, f1(volume_residual<P, S::stress>));
+      c.residual("exact rate and flux", pressure, f0(volume_residual<P, S::rate>), f1(volume_residual<P, S::flux>));
       return PETSC_SUCCESS;
     }
-    c.residual("body force", displacement, volume_residual<P, S::body_force>, nullptr);
-    c.residual("mass source", pressure, volume_residual<P, S::mass_source>, nullptr);
-    c.surface_residual("traction", "x1", displacement, surface_residual<P, S::template traction<Wall::sprung>>,
-                       nullptr);
-    c.surface_residual("traction", "y1", displacement, surface_residual<P, S::template traction<Wall::pressurised>>,
-                       nullptr);
+    c.residual("body force", displacement, f0(volume_residual<P, S::body_force>));
+    c.residual("mass source", pressure, f0(volume_residual<P, S::mass_source>));
+    c.surface_residual("traction", "x1", displacement, f0(surface_residual<P, S::template traction<Wall::sprung>>));
+    c.surface_residual("traction", "y1", displacement,
+                       f0(surface_residual<P, S::template traction<Wall::pressurised>>));
     for (const char *face : {"z0", "z1"})
-      c.surface_residual("traction", face, displacement, surface_residual<P, S::template traction<Wall::plain>>,
-                         nullptr);
+      c.surface_residual("traction", face, displacement, f0(surface_residual<P, S::template traction<Wall::plain>>));
     for (const char *face : {"x0", "y0", "y1", "z1"})
-      c.surface_residual("outflow", face, pressure, surface_residual<P, S::outflow>, nullptr);
+      c.surface_residual("outflow", face, pressure, f0(surface_residual<P, S::outflow>));
     return PETSC_SUCCESS;
   }
 
