@@ -301,7 +301,7 @@ PetscErrorCode Assembly::residual(Part part, PetscReal t, Vec x, Vec x_t, const 
 }
 
 PetscErrorCode Assembly::jacobian(Part part, PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[],
-                                  Mat A, FixedStress *schur)
+                                  Mat A, CellMatrices *also)
 {
   PetscFunctionBeginUser;
   PetscCall(map_matrix(A));
@@ -316,8 +316,8 @@ PetscErrorCode Assembly::jacobian(Part part, PetscReal t, Vec x, Vec x_t, PetscR
       PetscCall(compat::integrate_jacobian(PetscFEIntegrateJacobian, ds_, {nullptr, 0, pair, 0}, n, geom, u, u_t, t,
                                            shift, matrices));
     const auto begin = static_cast<PetscInt>((geom->detJ - detJ_.data()));
-    for (PetscInt i = 0; schur && i < n; ++i)
-      PetscCall(schur->add(begin + i, matrices + i * element_size_ * element_size_, row_scale));
+    for (PetscInt i = 0; also && i < n; ++i)
+      PetscCall(also->add(begin + i, matrices + i * element_size_ * element_size_, row_scale));
     PetscFunctionReturn(PETSC_SUCCESS);
   };
   const auto on_facets = [&](const Facets &facets, PetscInt n, PetscFEGeom *geom, const PetscScalar *u,

@@ -19,9 +19,6 @@ constexpr double least_ratio = 1.2;
 /// Volumes at rest of two meshes of one lung differ by less than this share.
 constexpr double same_lung = 0.1;
 
-/// Factors of safety of an extrapolation whose order is as it should be, or not (Oberkampf & Roy 2010).
-constexpr double factor_of_safety = 1.25, doubtful_factor = 3;
-
 /// Steps that are less longer than this, of those asked to be twice as long, tell nothing of the error in time: they
 /// land on the ends of phases.
 constexpr double least_coarsening = 1.2;
@@ -38,9 +35,6 @@ enum { fine, other, twice, four_times, tight, n_levels };
 
 /// What each step leaves undone may add up, and the solver is judged by runs of so many times fewer steps.
 constexpr double steps_saved = 4;
-
-/// Ends of the names of PETSc's options that print or write, maybe to a file of the run itself.
-constexpr const char *viewer_ends[] = {"_view", "_view_pre", "_monitor", "_converged_reason"};
 
 bool is_output_option(const std::string &name)
 {
@@ -192,43 +186,6 @@ ErrorBar error_bar(const std::vector<ErrorLevel> &levels, std::size_t i, int ord
 }
 
 } // namespace
-
-bool prints(const std::string &option)
-{
-  const auto ends = [&](const std::string &end) {
-    return option.size() > end.size() && option.compare(option.size() - end.size(), end.size(), end) == 0;
-  };
-  return std::any_of(std::begin(viewer_ends), std::end(viewer_ends), ends) ||
-         option.find("_monitor_") != std::string::npos;
-}
-
-TimeError time_error(double fine, double twice, double four_times, int order)
-{
-  const double near = fine - twice, far = twice - four_times;
-  if (near == 0 || !(far / near > 0)) return {factor_of_safety * std::max(std::abs(near), std::abs(far)), {}};
-  const double observed = std::log2(far / near);
-  const bool as_it_should = std::abs(observed - order) <= 0.1 * order;
-  const double used = as_it_should ? order : std::clamp(observed, 0.5, double(order)),
-               safety = as_it_should ? factor_of_safety : doubtful_factor;
-  return {safety * std::abs(near) / (std::exp2(used) - 1), observed};
-}
-
-double space_error(double difference, double ratio)
-{
-  return factor_of_safety * std::abs(difference / (1 - ratio));
-}
-
-std::optional<double> ErrorBar::total() const
-{
-  return time && space && solver ? std::optional<double>(*time + *space + *solver) : std::nullopt;
-}
-
-double ErrorReport::extra_seconds() const
-{
-  double sum = 0;
-  for (std::size_t i = 1; i < levels.size(); ++i) sum += levels[i].seconds;
-  return sum;
-}
 
 PetscErrorCode ErrorEstimate::declare(Options &options)
 {

@@ -705,15 +705,6 @@ PetscErrorCode Model::residual(PetscReal t, Vec x, Vec x_t, Vec F)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Model::use_fixed_stress()
-{
-  PetscFunctionBeginUser;
-  PulmoUserCheck(own_, PetscObjectComm((PetscObject)(DM)dm_),
-                 "-pc_fieldsplit_schur_precondition user needs pulmo's own integration; leave -petscfe_type out");
-  PetscCall(fixed_stress_.setup(dm_, assembly_));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
 /// PETSc's own loop over cells, then the scaling of the rows.
 PetscErrorCode Model::stock_residual(PetscReal t, Vec x, Vec x_t, Vec F)
 {
@@ -746,15 +737,14 @@ PetscErrorCode Model::jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, Mat
 {
   PetscFunctionBeginUser;
   if (!own_) PetscCall(stock_jacobian(t, x, x_t, shift, A));
-  FixedStress *const schur = fixed_stress_.in_use() ? &fixed_stress_ : nullptr;
-  if (schur) PetscCall(schur->begin());
+  if (also_) PetscCall(also_->begin());
   PetscCall(assembly_.jacobian(own_ ? Assembly::Part::all : Assembly::Part::facets, t, x, x_t, shift, row_scale_.data(),
-                               A, schur));
-  if (schur) {
+                               A, also_));
+  if (also_) {
     std::vector<PetscInt> closed;
     if (airway_held_)
       for (const AirwayNode &node : airway_) closed.push_back(node.point);
-    PetscCall(schur->end(closed));
+    PetscCall(also_->end(closed));
   }
   if (closes_rows_ && airway_held_)
     PetscCall(MatZeroRowsColumns(A, (PetscInt)closed_rows_.size(), closed_rows_.data(), 1, nullptr, nullptr));

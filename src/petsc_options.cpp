@@ -8,6 +8,9 @@ namespace pulmo {
 
 namespace {
 
+/// Ends of the names of PETSc's options that print or write, maybe to a file of the run itself.
+constexpr const char *viewer_ends[] = {"_view", "_view_pre", "_monitor", "_converged_reason"};
+
 /// A number among PETSc's options.
 struct Number {
   const char *name, *unit;
@@ -138,6 +141,15 @@ PetscErrorCode Options::check_petsc() const
   }
   PetscCall(check_refused(given));
   PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+bool prints(const std::string &option)
+{
+  const auto ends = [&](const std::string &end) {
+    return option.size() > end.size() && option.compare(option.size() - end.size(), end.size(), end) == 0;
+  };
+  return std::any_of(std::begin(viewer_ends), std::end(viewer_ends), ends) ||
+         option.find("_monitor_") != std::string::npos;
 }
 
 } // namespace pulmo

@@ -1,6 +1,5 @@
 #include "pulmo/preconditioning.hpp"
 
-#include "pulmo/assembly.hpp"
 #include "pulmo/elements.hpp"
 #include "pulmo/pattern.hpp"
 #include "pulmo/point.hpp"

@@ -1,6 +1,7 @@
 #include "pulmo/pulmo.hpp"
 
 #include "pulmo/checkpoint.hpp"
+#include "pulmo/error_estimate.hpp"
 #include "pulmo/errors.hpp"
 #include "pulmo/free_boundary.hpp"
 #include "pulmo/held.hpp"

@@ -255,8 +255,11 @@ PetscErrorCode Simulation::offer_fixed_stress(KSP ksp)
   if (!has_schur) PetscFunctionReturn(PETSC_SUCCESS); // another -pc_fieldsplit_type
   PetscCall(PCFieldSplitGetSchurPre(pc, &type, &none));
   if (type != PC_FIELDSPLIT_SCHUR_PRE_USER) PetscFunctionReturn(PETSC_SUCCESS);
-  PetscCall(model_.use_fixed_stress());
-  PetscCall(PCFieldSplitSetSchurPre(pc, type, model_.fixed_stress()));
+  PulmoUserCheck(model_.own_integration(), options_.comm(),
+                 "-pc_fieldsplit_schur_precondition user needs pulmo's own integration; leave -petscfe_type out");
+  PetscCall(fixed_stress_.setup(model_.dm(), model_.assembly()));
+  model_.also_fill(fixed_stress_);
+  PetscCall(PCFieldSplitSetSchurPre(pc, type, fixed_stress_.matrix()));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

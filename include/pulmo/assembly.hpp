@@ -5,7 +5,7 @@
 
 #include "pulmo/integration.hpp"
 #include "pulmo/kinematics.hpp"
-#include "pulmo/preconditioning.hpp"
+#include "pulmo/petsc.hpp"
 
 #include <cstdint>
 #include <vector>
@@ -20,6 +20,18 @@ struct Measures {
   PetscReal where[3] = {0, 0, 0}; ///< material centroid of the cell with min_J, mm
   PetscInt cell = -1;             ///< its number on rank @p rank
   PetscMPIInt rank = 0;
+};
+
+/// Takes the element matrices of the cells while a Jacobian is assembled.
+class CellMatrices {
+public:
+  virtual ~CellMatrices() = default;
+  /// Begins a new Jacobian.
+  virtual PetscErrorCode begin() = 0;
+  /// Adds cell @p c (counted from 0) from its element matrix, rows scaled by @p row_scale.
+  virtual PetscErrorCode add(PetscInt c, const PetscScalar *matrix, const PetscReal row_scale[]) = 0;
+  /// Completes it; @p closed: mesh points whose pressure is held.
+  virtual PetscErrorCode end(const std::vector<PetscInt> &closed) = 0;
 };
 
 /// Assembly over the cells and named facets of a DM whose fields, PetscDS and sections are complete.
@@ -44,9 +56,9 @@ public:
   /// Adds the residual of the local vectors @p x and @p x_t to F; rows of field f are multiplied by row_scale[f].
   PetscErrorCode residual(Part part, PetscReal t, Vec x, Vec x_t, const PetscReal row_scale[], Vec F);
   /// A = dF/dx + shift dF/dx_t, rows scaled alike; Part::facets adds to A.
-  /// With @p schur the element matrices of the cells go there too.
+  /// With @p also the element matrices of the cells go there too.
   PetscErrorCode jacobian(Part part, PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[], Mat A,
-                          FixedStress *schur = nullptr);
+                          CellMatrices *also = nullptr);
   /// J and its integral for the local vector @p x.
   PetscErrorCode measure(Vec x, Measures &measures) const;
   /// int cof F(x) : Grad y, the derivative of int (J - 1) in direction @p y, mm^3.

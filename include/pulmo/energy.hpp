@@ -9,8 +9,9 @@
 /// knows no effect by name. "numerical" is evaluated by formulas of its own, not as what is left over.
 #pragma once
 
+#include "pulmo/observer.hpp"
 #include "pulmo/sampling.hpp"
-#include "pulmo/simulation.hpp"
+#include "pulmo/scene.hpp"
 
 namespace pulmo {
 

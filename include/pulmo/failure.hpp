@@ -3,9 +3,9 @@
 /// that says so.
 #pragma once
 
-#include "pulmo/clinical.hpp"
 #include "pulmo/model.hpp"
 #include "pulmo/scene.hpp"
+#include "pulmo/signal_row.hpp"
 
 #include <optional>
 #include <string>

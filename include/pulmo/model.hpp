@@ -60,9 +60,8 @@ public:
   /// Global Jacobian dF/dx + shift dF/dx_t, rows scaled.
   PetscErrorCode jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, Mat A);
 
-  /// Makes the fixed-stress matrix for the Schur complement on the pressure; each Jacobian fills it from then on.
-  PetscErrorCode use_fixed_stress();
-  Mat fixed_stress() const { return fixed_stress_.matrix(); }
+  /// Lets each Jacobian hand its element matrices to @p matrices, too, which must outlive the model.
+  void also_fill(CellMatrices &matrices) { also_ = &matrices; }
 
   /// The entry of a global vector that belongs to the one common pressure of the airway, where that is an unknown: a
   /// node of the airway, or without airflow a dof of its own.
@@ -137,7 +136,7 @@ private:
   PetscInt quadrature_degree_ = 3;
   bool own_ = true;
   Assembly assembly_;
-  FixedStress fixed_stress_;
+  CellMatrices *also_ = nullptr;
 };
 
 } // namespace pulmo

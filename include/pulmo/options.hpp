@@ -138,4 +138,7 @@ private:
   std::set<std::string> told_; ///< options of which warn_unused() has warned
 };
 
+/// Whether an option of PETSc's prints or writes, and changes nothing else.
+bool prints(const std::string &option);
+
 } // namespace pulmo

@@ -3,9 +3,10 @@
 #pragma once
 
 #include "pulmo/energy.hpp"
-#include "pulmo/error_estimate.hpp"
+#include "pulmo/error_bars.hpp"
 #include "pulmo/regions.hpp"
 #include "pulmo/run_lock.hpp"
+#include "pulmo/simulation.hpp"
 
 #include <cstdio>
 #include <memory>

@@ -3,13 +3,11 @@
 /// type `p_multigrid`, and the fixed-stress matrix for Schur fieldsplits.
 #pragma once
 
-#include "pulmo/petsc.hpp"
+#include "pulmo/assembly.hpp"
 
 #include <vector>
 
 namespace pulmo {
-
-class Assembly;
 
 /// Registers the PC type `p_multigrid`: two levels, the displacement above its P1 interpolant, Galerkin coarse matrix
 /// with rigid-body modes. Options under the prefix of the PC: `-pmg_levels_*` (smoother), `-pmg_coarse_*` (the P1
@@ -24,19 +22,15 @@ PetscErrorCode attach_rigid_body_modes(DM dm);
 /// with w a uniform dilation of the cell: the pressure's own block and the storage that the tissue's compliance gives
 /// (Kim, Tchelepi & Juanes 2011; White, Castelletto & Tchelepi 2016). Made of the element matrices alone, so it knows
 /// no tissue law.
-class FixedStress {
+class FixedStress final : public CellMatrices {
 public:
   /// @p dm with fields displacement and pressure.
   PetscErrorCode setup(DM dm, const Assembly &assembly);
-  bool in_use() const { return matrix_; }
   Mat matrix() const { return matrix_; }
 
-  /// Begins a new Jacobian.
-  PetscErrorCode begin();
-  /// Adds cell @p c (counted from 0) from its element matrix, rows scaled by @p row_scale.
-  PetscErrorCode add(PetscInt c, const PetscScalar *matrix, const PetscReal row_scale[]);
-  /// Completes it; @p closed: mesh points whose pressure is held.
-  PetscErrorCode end(const std::vector<PetscInt> &closed);
+  PetscErrorCode begin() override;
+  PetscErrorCode add(PetscInt c, const PetscScalar *matrix, const PetscReal row_scale[]) override;
+  PetscErrorCode end(const std::vector<PetscInt> &closed) override;
 
 private:
   PetscErrorCode make_mass_matrix(PetscDS ds);

@@ -2,9 +2,11 @@
 /// The lung part by part: volume, deformation and alveolar pressure of the whole, of each body and of each named part.
 #pragma once
 
+#include "pulmo/clinical.hpp"
 #include "pulmo/mesh.hpp"
+#include "pulmo/observer.hpp"
 #include "pulmo/sampling.hpp"
-#include "pulmo/simulation.hpp"
+#include "pulmo/scene.hpp"
 
 namespace pulmo {
 

@@ -3,13 +3,13 @@
 #pragma once
 
 #include "pulmo/airway.hpp"
-#include "pulmo/archive.hpp"
 #include "pulmo/balance.hpp"
-#include "pulmo/clinical.hpp"
 #include "pulmo/failure.hpp"
 #include "pulmo/lagging.hpp"
 #include "pulmo/model.hpp"
+#include "pulmo/observer.hpp"
 #include "pulmo/pins.hpp"
+#include "pulmo/preconditioning.hpp"
 #include "pulmo/predictor.hpp"
 #include "pulmo/scene.hpp"
 #include "pulmo/step_control.hpp"
@@ -18,27 +18,6 @@
 #include <set>
 
 namespace pulmo {
-
-/// What an observer sees after each accepted step (and once at the start).
-struct StepReport {
-  const std::vector<SignalRow> &rows; ///< of the whole run so far, this one last
-  SignalRow row;
-  Measures measures;
-  PetscReal mass_balance_error; ///< int (J - 1) less what flowed in, by the time scheme, mm^3
-  Vec local;                    ///< state with constrained values in place
-  Vec residual;                 ///< local, rows scaled; not of the row at the start
-  PetscReal end;                ///< when the run ends, s
-  bool phase_ends;              ///< this row is the last of its phase
-};
-
-/// Watches a run and never steers it.
-class Observer {
-public:
-  virtual ~Observer() = default;
-  virtual PetscErrorCode observe(const StepReport &) = 0;
-  /// Writes or reads what it remembers of the run so far. @p local: the state of the last row, as in StepReport.
-  virtual PetscErrorCode persist(Archive &, [[maybe_unused]] Vec local) { return PETSC_SUCCESS; }
-};
 
 /// Wall seconds by stage, largest over the ranks at the end.
 struct StageSeconds {
@@ -160,6 +139,7 @@ private:
   Predictor predictor_;
   PinForces pins_;
   Lagging lagging_;
+  FixedStress fixed_stress_;
   std::vector<Observer *> observers_;
   StopSignal *stop_signal_ = nullptr;
   TSHandle ts_;
