@@ -201,10 +201,20 @@ PetscErrorCode Simulation::create_solver()
   if (scene_.facts().common_pressure()) {
     SNESLineSearch search;
     PetscBool newton;
+    SNESType type;
+    const SceneFacts &facts = scene_.facts();
+    const bool limits = facts.ventilator->limits_pressure(), split = facts.airflow && !facts.tube && !limits;
     PetscCall(PetscObjectTypeCompare((PetscObject)snes, SNESNEWTONLS, &newton));
+    PetscCall(SNESGetType(snes, &type));
     PulmoUserCheck(newton, comm,
-                   "-snes_type: an airway pressure that is an unknown of its own needs Newton with line search; use "
-                   "-snes_type newtonls");
+                   "option -snes_type %s does not go with %s: there the airway pressure is an unknown of its own, which "
+                   "needs Newton with line search; use -snes_type newtonls%s",
+                   type,
+                   facts.tube ? "-tube"
+                   : limits   ? "a limit of pressure"
+                   : split    ? "-ventilator_flow_split common_pressure"
+                              : "a flow into a lung with -airflow off",
+                   split ? ", or -ventilator_flow_split uniform" : "");
     for (const char *option : {"-snes_mf", "-snes_mf_operator", "-snes_fd", "-snes_fd_color"}) {
       PetscBool given = PETSC_FALSE;
       PetscCall(PetscOptionsGetBool(nullptr, nullptr, option, &given, nullptr));

@@ -443,9 +443,16 @@ def table(m):
         "tube without ventilator": (lung + ["-tube", "-tube_k1", "2"], ["-tube", "-ventilator"]),
         "trust region with a common pressure": (
             lung + ["-ventilator", "vcv", "-ventilator_flow_split", "common_pressure", "-snes_type", "newtontr"],
-            ["-snes_type", "newtonls"]),
+            ["-snes_type newtontr", "-ventilator_flow_split common_pressure", "-snes_type newtonls",
+             "or -ventilator_flow_split uniform"]),
         "trust region with a tube": (good + ["-tube", "-tube_k1", "2", "-snes_type", "newtontr"],
-                                     ["-snes_type", "newtonls"]),
+                                     ["-snes_type newtontr does not go with -tube", "use -snes_type newtonls"]),
+        "trust region with a limit": (
+            file_of("limited.txt", b"inspiration 1 flow 100 limit 5\n") + ["-snes_type", "newtontr"],
+            ["-snes_type newtontr does not go with a limit of pressure", "use -snes_type newtonls"]),
+        "trust region with a volume of uniform gas": (
+            lung + ["-airflow", "off", "-ventilator", "vcv", "-snes_type", "newtontr"],
+            ["-snes_type newtontr does not go with a flow into a lung with -airflow off", "use -snes_type newtonls"]),
         "stock loops with a volume of uniform gas": (
             lung + ["-airflow", "off", "-ventilator", "vcv", "-petscfe_type", "basic"], ["-petscfe_type basic", "pulmo"]),
         # solver and time
