@@ -1,5 +1,6 @@
 #include "pulmo/assembly.hpp"
 
+#include "pulmo/parameter_fields.hpp"
 #include "pulmo/simd.hpp"
 
 #include <algorithm>
@@ -12,7 +13,8 @@ namespace pulmo {
 struct Assembly::Facets {
   PetscWeakForm wf = nullptr;
   PetscFormKey key{};
-  std::vector<PetscInt> cells; ///< the cell behind each facet
+  std::vector<PetscInt> cells;      ///< the cell behind each facet
+  std::vector<PetscReal> constants; ///< [facet][those that differ from place to place]
   PetscFEGeom *geom = nullptr;
 
   ~Facets() { (void)PetscFEGeomDestroy(&geom); }
@@ -42,7 +44,7 @@ Assembly::~Assembly()
   delete map_;
 }
 
-PetscErrorCode Assembly::setup(DM dm, PetscDS rate_ds)
+PetscErrorCode Assembly::setup(DM dm, PetscDS rate_ds, const ParameterFields *varying)
 {
   PetscFunctionBeginUser;
   dm_ = dm;
@@ -52,6 +54,21 @@ PetscErrorCode Assembly::setup(DM dm, PetscDS rate_ds)
   PetscCall(IntegrationLog::attach(ds_, &log_));
   PetscCall(setup_cells());
   PetscCall(setup_facets());
+  if (varying) PetscCall(setup_varying(*varying));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Assembly::setup_varying(const ParameterFields &fields)
+{
+  PetscFunctionBeginUser;
+  varying_.offsets = fields.offsets();
+  for (PetscInt c = 0; c < cells_; ++c) fields.append(c, "", cell_constants_);
+  for (Facets *facets : facets_) {
+    const char *surface;
+    PetscCall(PetscObjectGetName((PetscObject)facets->key.label, &surface));
+    for (const PetscInt cell : facets->cells) fields.append(cell, surface, facets->constants);
+  }
+  PetscCall(VaryingConstants::attach(ds_, &varying_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -245,32 +262,58 @@ PetscErrorCode Assembly::for_blocks(Part part, Vec x, Vec x_t, PetscInt result_s
       u_t[i * element_size_ + k] = xts[dofs[k]];
     }
   };
-  const PetscInt n_cells = part == Part::all ? cells_ : 0;
-  for (PetscInt begin = 0, block = 0; begin < n_cells; begin += block_cells, ++block) {
-    const PetscInt n = std::min(block_cells, n_cells - begin);
+  const PetscInt n_cells = part == Part::all ? cells_ : 0, most = places_per_call();
+  for (PetscInt begin = 0, block = 0; begin < n_cells; begin += most, ++block) {
+    const PetscInt n = std::min(most, n_cells - begin);
     PetscFEGeom geom = block_geometry(begin, n);
     for (PetscInt i = 0; i < n; ++i) gather(i, begin + i);
     std::fill(results.begin(), results.end(), 0.0);
     log_.timing = block % timed_share == 0;
     if (log_.timing) log_.timed_cells += n;
+    PetscCall(put_varying(cell_constants_, begin));
     PetscCall(on_cells(n, &geom, u.data(), u_t.data(), results.data()));
     for (PetscInt i = 0; i < n; ++i) PetscCall(scatter(begin + i, &results[i * result_size]));
   }
   log_.timing = true;
   for (const Facets *facets : facets_) {
     const auto total = static_cast<PetscInt>(facets->cells.size());
-    for (PetscInt begin = 0; begin < total; begin += block_cells) {
-      const PetscInt n = std::min(block_cells, total - begin);
+    for (PetscInt begin = 0; begin < total; begin += most) {
+      const PetscInt n = std::min(most, total - begin);
       PetscFEGeom *chunk = nullptr;
       for (PetscInt i = 0; i < n; ++i) gather(i, facets->cells[begin + i]);
       std::fill(results.begin(), results.end(), 0.0);
       PetscCall(PetscFEGeomGetChunk(facets->geom, begin, begin + n, &chunk));
+      PetscCall(put_varying(facets->constants, begin));
       PetscCall(on_facets(*facets, n, chunk, u.data(), u_t.data(), results.data()));
       PetscCall(PetscFEGeomRestoreChunk(facets->geom, begin, begin + n, &chunk));
       for (PetscInt i = 0; i < n; ++i) PetscCall(scatter(facets->cells[begin + i], &results[i * result_size]));
     }
   }
   log_.timing = false;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Other types of PetscFE know one set of constants for all places of a call.
+PetscInt Assembly::places_per_call() const
+{
+  return rate_ds_ && !varying_.offsets.empty() ? 1 : block_cells;
+}
+
+/// Lets the next call find the constants of its places, the first of which is @p begin.
+PetscErrorCode Assembly::put_varying(const std::vector<PetscReal> &rows, PetscInt begin)
+{
+  const std::size_t n = varying_.offsets.size();
+  PetscInt n_constants;
+  const PetscScalar *constants;
+
+  PetscFunctionBeginUser;
+  if (n == 0) PetscFunctionReturn(PETSC_SUCCESS);
+  varying_.rows = &rows[static_cast<std::size_t>(begin) * n];
+  if (places_per_call() > 1) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(PetscDSGetConstants(ds_, &n_constants, &constants));
+  std::vector<PetscScalar> local(constants, constants + n_constants);
+  for (std::size_t k = 0; k < n; ++k) local[static_cast<std::size_t>(varying_.offsets[k])] = varying_.rows[k];
+  PetscCall(PetscDSSetConstants(ds_, n_constants, local.data()));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -282,7 +325,7 @@ PetscErrorCode Assembly::residual(Part part, PetscReal t, Vec x, Vec x_t, const 
                             PetscScalar *vectors) -> PetscErrorCode {
     PetscFunctionBeginUser;
     for (PetscInt field = 0; field < n_fields_; ++field)
-      PetscCall(PetscFEIntegrateResidual(ds_, {nullptr, 0, field, 0}, n, geom, u, u_t, nullptr, nullptr, t, vectors));
+      PetscCall(PetscFEIntegrateResidual(ds_, {nullptr, 0, field, 0}, n, geom, u, u_t, rate_ds_, u_t, t, vectors));
     PetscFunctionReturn(PETSC_SUCCESS);
   };
   const auto on_facets = [&](const Facets &facets, PetscInt n, PetscFEGeom *geom, const PetscScalar *u,
@@ -313,8 +356,8 @@ PetscErrorCode Assembly::jacobian(Part part, PetscReal t, Vec x, Vec x_t, PetscR
                             PetscScalar *matrices) -> PetscErrorCode {
     PetscFunctionBeginUser;
     for (PetscInt pair = 0; pair < n_fields_ * n_fields_; ++pair)
-      PetscCall(compat::integrate_jacobian(PetscFEIntegrateJacobian, ds_, {nullptr, 0, pair, 0}, n, geom, u, u_t, t,
-                                           shift, matrices));
+      PetscCall(compat::integrate_jacobian(PetscFEIntegrateJacobian, ds_, {nullptr, 0, pair, 0}, n, geom, u, u_t,
+                                           rate_ds_, t, shift, matrices));
     const auto begin = static_cast<PetscInt>((geom->detJ - detJ_.data()));
     for (PetscInt i = 0; also && i < n; ++i)
       PetscCall(also->add(begin + i, matrices + i * element_size_ * element_size_, row_scale));

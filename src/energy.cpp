@@ -69,6 +69,7 @@ PetscErrorCode EnergyAudit::setup()
     const auto [entry, is_new] = part_of.try_emplace(term.surface, parts_.size());
     if (is_new) {
       parts_.emplace_back();
+      parts_.back().surface = term.surface;
       if (term.surface.empty())
         parts_.back().elements = sampling_.cells();
       else
@@ -110,9 +111,6 @@ PetscErrorCode EnergyAudit::persist(Archive &archive, Vec local)
 
 PetscErrorCode EnergyAudit::integrate(const Part &part, const StepReport &step, std::vector<double> &sums)
 {
-  PetscDS ds;
-  PetscInt n_constants;
-  const PetscScalar *constants;
   std::vector<Sample> now, before;
   const PetscReal t = step.row.time, dt = step.row.dt;
   Step step_now(dt), step_before(dt);
@@ -121,11 +119,10 @@ PetscErrorCode EnergyAudit::integrate(const Part &part, const StepReport &step, 
   step_now.load = model_.load();
   step_now.gas_pressure = step.row.pressure * units::kPa_per_cmH2O;
   step_before.gas_pressure = gas_pressure_;
-  PetscCall(DMGetDS(model_.dm(), &ds));
-  PetscCall(PetscDSGetConstants(ds, &n_constants, &constants));
   const ReadArray x(step.local), x_before(before_);
   for (const Sampling::Element &e : part.elements) {
     const auto &weights = sampling_.weights(e);
+    const PetscScalar *constants = model_.constants_at(e.cell, part.surface);
     sampling_.sample(e, x.data(), now);
     sampling_.sample(e, x_before.data(), before);
     for (std::size_t q = 0; q < weights.size(); ++q) {

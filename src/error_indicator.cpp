@@ -237,22 +237,19 @@ PetscErrorCode ErrorIndicator::estimate(Vec local, CellErrors &errors)
   const auto &cells = sampling_.cells();
   std::vector<Sample> samples;
   std::vector<PetscScalar> stresses, gradients;
-  PetscDS ds;
-  const PetscScalar *constants;
   const Step second; // the densities of a step of 1 s are powers
 
   PetscFunctionBeginUser;
-  PetscCall(DMGetDS(model_.dm(), &ds));
-  PetscCall(PetscDSGetConstants(ds, nullptr, &constants));
   const ReadArray x(local);
   for (const Sampling::Element &e : cells) {
+    const PetscScalar *constants = model_.constants_at(e.cell);
     const auto &weights = sampling_.weights(e);
     PetscScalar mean[9] = {0}, moments[4][9] = {{0}}, mean_gradient[3] = {0};
     sampling_.sample(e, x.data(), samples);
     for (std::size_t q = 0; q < weights.size(); ++q) {
       const auto lambda = barycentric(e, samples[q].x);
       PetscScalar P[9];
-      law.stress(samples[q].state, P);
+      law.stress(samples[q].state, constants, P);
       for (int i = 0; i < 9; ++i) {
         mean[i] += weights[q] * P[i];
         for (int k = 0; k < 4; ++k) moments[k][i] += weights[q] * lambda[k] * P[i];
@@ -272,6 +269,7 @@ PetscErrorCode ErrorIndicator::estimate(Vec local, CellErrors &errors)
   errors.flow.assign(gas ? cells.size() : 0, 0);
   for (std::size_t c = 0; c < cells.size(); ++c) {
     const Sampling::Element &e = cells[c];
+    const PetscScalar *constants = model_.constants_at(e.cell);
     const auto &weights = sampling_.weights(e);
     sampling_.sample(e, x.data(), samples);
     for (std::size_t q = 0; q < weights.size(); ++q) {
@@ -279,7 +277,7 @@ PetscErrorCode ErrorIndicator::estimate(Vec local, CellErrors &errors)
       const auto lambda = barycentric(e, s.x);
       const PetscReal w = weights[q] * e.measure * units::j_per_kPa_mm3, w_stress = w / (2 * model_.modulus());
       PetscScalar P[9], error[9];
-      law.stress(s.state, P);
+      law.stress(s.state, constants, P);
       stress_.evaluate(c, lambda.data(), error);
       for (int i = 0; i < 9; ++i) error[i] -= P[i];
       whole[0] += w_stress * contract(P, P);

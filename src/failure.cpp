@@ -146,6 +146,10 @@ PetscErrorCode look_at_tissue(const Scene &scene, const Model &model, Vec local,
   const auto lost = [&](PetscReal stiffness, PetscReal at_rest) {
     return stiffness < std::max<PetscReal>(no_stiffness * at_rest, 0) - rounding * model.modulus();
   };
+  const bool varies = model.composition().varying() != nullptr;
+  const auto at_rest = [&](const PetscScalar *constants) { // in the state at hand, which is that
+    return varies ? acoustic_stiffness(law, state, true, constants).least : d.acoustic_at_rest;
+  };
   PetscCall(sampling.setup(model));
   {
     const ReadArray x(local);
@@ -158,8 +162,11 @@ PetscErrorCode look_at_tissue(const Scene &scene, const Model &model, Vec local,
         sums[9] += weights[q] * cell.measure * samples[q].state.J_minus_1;
       }
       for (int i = 0; i < 9; ++i) sums[i] += cell.measure * H[i];
+      const PetscScalar *constants = model.constants_at(cell.cell);
       make_point_state(H, nullptr, state);
-      if (lost(acoustic_stiffness(law, state, false).least, d.acoustic_at_rest)) sums[10] += cell.measure;
+      const PetscReal least = acoustic_stiffness(law, state, false, constants).least;
+      make_point_state(zero, nullptr, state);
+      if (lost(least, at_rest(constants))) sums[10] += cell.measure;
       sums[11] += cell.measure;
     }
   }
@@ -273,13 +280,14 @@ std::string what_to_try(const Scene &scene, const Diagnosis &d)
 
 } // namespace
 
-AcousticStiffness acoustic_stiffness(const TissueLaw &law, const PointState &state, bool refine)
+AcousticStiffness acoustic_stiffness(const TissueLaw &law, const PointState &state, bool refine,
+                                     const PetscScalar *constants)
 {
   PetscScalar A[81];
   AcousticStiffness found;
   PetscReal polar = 0, azimuth = 0;
 
-  law.tangent(state, A);
+  law.tangent(state, constants, A);
   const auto look = [&](PetscReal at_polar, PetscReal at_azimuth) {
     const Direction n = direction(at_polar, at_azimuth);
     const PetscReal stiffness = stiffness_along(A, n);

@@ -384,12 +384,13 @@ PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
   std::vector<PointState> states;
   const auto &weights = assembly.relative_weights();
   for (PetscInt c = 0; c < assembly.cells(); ++c) {
+    const PetscScalar *constants = model_.constants_at(c);
     assembly.point_states(c, x.data(), states);
     PetscScalar mean_J = 0, mean_h = 0, mean_m = 0;
     for (std::size_t q = 0; q < weights.size(); ++q) {
       const PointState &s = states[q];
       PetscScalar P[9], sigma[9];
-      law.stress(s, P);
+      law.stress(s, constants, P);
       for (int i = 0; i < 3; ++i)
         for (int j = 0; j < 3; ++j) // Cauchy: P F^T / J
           sigma[3 * i + j] =

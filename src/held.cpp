@@ -1,5 +1,7 @@
 #include "pulmo/held.hpp"
 
+#include "pulmo/parameter_fields.hpp"
+
 #include <algorithm>
 #include <cmath>
 #include <numeric>
@@ -97,7 +99,8 @@ std::vector<Hold> holds_of(const Composition &composition)
 /// The force per displacement that a term answers with at rest, K[3 i + j].
 class Resistance {
 public:
-  explicit Resistance(const Composition &composition) : constants_(composition.constants(Step()))
+  explicit Resistance(const Composition &composition)
+      : varying_(composition.varying()), constants_(composition.constants(Step()))
   {
     PetscInt components = 0;
     for (const FieldSpec &field : composition.fields()) {
@@ -108,9 +111,10 @@ public:
     zero_.assign(static_cast<std::size_t>(3 * components), 0);
   }
 
-  /// @p normal: null in the volume.
-  void at(const Term &term, const PetscReal x[3], const PetscReal *normal, PetscScalar K[9]) const
+  /// @p normal: null in the volume. @p cell: of this rank, counted from 0; behind the facet.
+  void at(const Term &term, PetscInt cell, const PetscReal x[3], const PetscReal *normal, PetscScalar K[9])
   {
+    if (varying_) varying_->patch(cell, term.surface, constants_);
     const auto fields = static_cast<PetscInt>(offset_.size());
     const auto n = static_cast<PetscInt>(constants_.size());
     std::fill(K, K + 9, 0);
@@ -123,6 +127,7 @@ public:
   }
 
 private:
+  const ParameterFields *varying_;
   std::vector<PetscScalar> constants_, zero_;
   std::vector<PetscInt> offset_, gradient_offset_;
 };
@@ -189,7 +194,8 @@ private:
   }
 
   /// Adds what holds a point of a body with K, or in the components of a constraint.
-  void add_point(std::size_t hold, PetscInt body, const PetscReal x[3], PetscReal weight, const PetscReal *normal)
+  void add_point(std::size_t hold, PetscInt body, PetscInt cell, const PetscReal x[3], PetscReal weight,
+                 const PetscReal *normal)
   {
     const HeldBody &b = bodies_[static_cast<std::size_t>(body)];
     Sum &sum = sums_[static_cast<std::size_t>(body) * holds_.size() + hold];
@@ -199,7 +205,7 @@ private:
     if (const Constraint *constraint = holds_[hold].constraint)
       for (int d = 0; d < 3; ++d) K[4 * d] = constraint->component[d];
     else
-      resistance_.at(*holds_[hold].term, x, normal, K);
+      resistance_.at(*holds_[hold].term, cell, x, normal, K);
     const auto u = unit_motions(r);
     for (std::size_t a = 0; a < n_motions; ++a)
       for (std::size_t c = 0; c < n_motions; ++c)
@@ -228,7 +234,7 @@ private:
       for (int e = 0; e < 3; ++e) {
         PetscReal x[3];
         PetscCall(mesh_.node_coordinates(edges[e], x));
-        add_point(hold, body_of_[cell[0] - cell_begin_], x, area / 3, normal);
+        add_point(hold, body_of_[cell[0] - cell_begin_], cell[0] - cell_begin_, x, area / 3, normal);
       }
     }
     PetscFunctionReturn(PETSC_SUCCESS);
@@ -251,7 +257,7 @@ private:
       PetscCall(DMPlexRestoreTransitiveClosure(mesh_.dm(), vertex, PETSC_FALSE, &n, &star));
       std::sort(bodies.begin(), bodies.end());
       bodies.erase(std::unique(bodies.begin(), bodies.end()), bodies.end());
-      for (const PetscInt body : bodies) add_point(hold, body, x, 1, nullptr);
+      for (const PetscInt body : bodies) add_point(hold, body, -1, x, 1, nullptr);
     }
     PetscFunctionReturn(PETSC_SUCCESS);
   }
@@ -271,7 +277,7 @@ private:
       PetscReal x[3] = {0, 0, 0};
       for (int i = 0; i < 4; ++i)
         for (int d = 0; d < 3; ++d) x[d] += (i == q ? near : far) * corner[i][d];
-      add_point(hold, body_of_[cell - cell_begin_], x, volume / 4, nullptr);
+      add_point(hold, body_of_[cell - cell_begin_], cell - cell_begin_, x, volume / 4, nullptr);
     }
     PetscFunctionReturn(PETSC_SUCCESS);
   }

@@ -511,6 +511,11 @@ public:
     PetscCall(PetscQuadratureGetData(rule, nullptr, nullptr, nullptr, &reference_, &weights_));
     PetscCall(facets_ ? PetscDSGetFaceTabulation(ds_, &T) : PetscDSGetTabulation(ds_, &T));
     PetscCall(PetscDSGetConstants(ds_, &n_constants, &constants));
+    PetscCall(VaryingConstants::find(ds_, &varying_));
+    if (varying_) {
+      local_constants_.assign(constants, constants + n_constants);
+      constants = local_constants_.data();
+    }
     PetscCall(IntegrationLog::find(ds_, &log));
     const PetscInt replicas = facets_ ? 4 : 1; // the faces of the reference cell
     tables_.emplace(replicas * fields_scratch(n_fields, T, 1));
@@ -520,9 +525,15 @@ public:
 
   const Fields &fields() const { return fields_[0]; }
 
-  /// Fills @p data for place @p e.
-  void visit(PetscInt e, const PetscScalar *coefficients, const PetscScalar *coefficients_t, PointData &data) const
+  /// Fills @p data, and the constants that differ, for place @p e.
+  void visit(PetscInt e, const PetscScalar *coefficients, const PetscScalar *coefficients_t, PointData &data)
   {
+    if (varying_) {
+      const std::size_t n = varying_->offsets.size();
+      for (std::size_t k = 0; k < n; ++k)
+        local_constants_[static_cast<std::size_t>(varying_->offsets[k])] =
+            varying_->rows[static_cast<std::size_t>(e) * n + k];
+    }
     const PetscInt stride = geom_->numPoints, size = fields().element_size, manifold = facets_ ? dim - 1 : dim;
     const PetscReal *inverse = (facets_ ? geom_->suppInvJ[0] : geom_->invJ) + e * stride * dim * dim;
     const PetscReal *v = geom_->v + e * stride * dim, *J = geom_->J + e * stride * dim * dim;
@@ -553,6 +564,8 @@ private:
   const PetscReal *reference_ = nullptr, *weights_ = nullptr;
   std::optional<Scratch> tables_;
   Fields fields_[4];
+  VaryingConstants *varying_ = nullptr;
+  std::vector<PetscScalar> local_constants_;
 };
 
 /// Residual of fields @p first ... @p last - 1 at all places; F is PetscPointFunc or PetscBdPointFunc.
@@ -749,27 +762,62 @@ PetscErrorCode create_fe(PetscFE fe)
 
 } // namespace
 
-PetscErrorCode IntegrationLog::attach(PetscDS ds, IntegrationLog *log)
+namespace {
+
+constexpr const char *log_name = "pulmo_integration_log", *varying_name = "pulmo_varying_constants";
+
+PetscErrorCode attach_pointer(PetscDS ds, const char *name, void *pointer)
 {
   PetscContainer container;
 
   PetscFunctionBeginUser;
   PetscCall(PetscContainerCreate(PETSC_COMM_SELF, &container));
-  PetscCall(PetscContainerSetPointer(container, log));
-  PetscCall(PetscObjectCompose((PetscObject)ds, "pulmo_integration_log", (PetscObject)container));
+  PetscCall(PetscContainerSetPointer(container, pointer));
+  PetscCall(PetscObjectCompose((PetscObject)ds, name, (PetscObject)container));
   PetscCall(PetscContainerDestroy(&container));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode IntegrationLog::find(PetscDS ds, IntegrationLog **log)
+PetscErrorCode find_pointer(PetscDS ds, const char *name, void **pointer)
 {
   PetscContainer container;
-  void *pointer = nullptr;
 
   PetscFunctionBeginUser;
-  PetscCall(PetscObjectQuery((PetscObject)ds, "pulmo_integration_log", (PetscObject *)&container));
-  if (container) PetscCall(PetscContainerGetPointer(container, &pointer));
+  *pointer = nullptr;
+  PetscCall(PetscObjectQuery((PetscObject)ds, name, (PetscObject *)&container));
+  if (container) PetscCall(PetscContainerGetPointer(container, pointer));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace
+
+PetscErrorCode IntegrationLog::attach(PetscDS ds, IntegrationLog *log)
+{
+  return attach_pointer(ds, log_name, log);
+}
+
+PetscErrorCode IntegrationLog::find(PetscDS ds, IntegrationLog **log)
+{
+  void *pointer;
+
+  PetscFunctionBeginUser;
+  PetscCall(find_pointer(ds, log_name, &pointer));
   *log = static_cast<IntegrationLog *>(pointer);
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode VaryingConstants::attach(PetscDS ds, VaryingConstants *varying)
+{
+  return attach_pointer(ds, varying_name, varying);
+}
+
+PetscErrorCode VaryingConstants::find(PetscDS ds, VaryingConstants **varying)
+{
+  void *pointer;
+
+  PetscFunctionBeginUser;
+  PetscCall(find_pointer(ds, varying_name, &pointer));
+  *varying = static_cast<VaryingConstants *>(pointer);
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -1,6 +1,7 @@
 #include "pulmo/model.hpp"
 
 #include "pulmo/mesh.hpp"
+#include "pulmo/parameter_fields.hpp"
 #include "pulmo/pattern.hpp"
 
 #include <algorithm>
@@ -47,7 +48,7 @@ PetscErrorCode Model::build(Composition composition, PetscReal modulus)
     PetscCall(create_stock());
     PetscCall(DMGetDS(rate_dm_, &rate_ds));
   }
-  PetscCall(assembly_.setup(dm_, rate_ds));
+  PetscCall(assembly_.setup(dm_, rate_ds, this->composition().varying()));
   row_scale_.assign(this->composition().fields().size(), 1);
   PetscCall(set_step(1, 0));
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -491,6 +492,29 @@ PetscErrorCode Composition::check_parameters(MPI_Comm comm) const
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscInt Composition::constant_at(const PetscReal *parameter, const char **owner) const
+{
+  PetscInt offset = 1 + 2 * static_cast<PetscInt>(parameters_.size() + 1) +
+                    static_cast<PetscInt>(sizeof(Step) / sizeof(PetscScalar)); // as constants() lists them
+  for (const ParameterBlock &block : parameters_) {
+    if (!std::less<>()(parameter, block.data) && std::less<>()(parameter, block.data + block.count)) {
+      *owner = block.owner;
+      return offset + static_cast<PetscInt>(parameter - block.data);
+    }
+    offset += block.count;
+  }
+  return -1;
+}
+
+std::vector<std::string> Composition::surfaces_that_read(const char *owner) const
+{
+  std::vector<std::string> list;
+  for (const Reader &reader : readers_)
+    if (!reader.surface.empty() && constants::tag(reader.owner) == constants::tag(owner))
+      list.push_back(reader.surface);
+  return list;
+}
+
 std::vector<PetscScalar> Composition::constants(const Step &step) const
 {
   std::vector<ParameterBlock> blocks = parameters_;
@@ -524,6 +548,15 @@ PetscErrorCode Model::pack_constants()
     PetscCall(PetscDSSetConstants(ds, n, constants_.data()));
   }
   PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+const PetscScalar *Model::constants_at(PetscInt cell, const std::string &surface) const
+{
+  const ParameterFields *varying = composition().varying();
+  if (!varying) return constants_.data();
+  local_constants_ = constants_;
+  varying->patch(cell, surface, local_constants_);
+  return local_constants_.data();
 }
 
 PetscErrorCode Model::constrain(PetscReal t, Vec local) const
@@ -700,8 +733,9 @@ PetscErrorCode Model::residual(PetscReal t, Vec x, Vec x_t, Vec F)
 {
   PetscFunctionBeginUser;
   PetscCall(VecZeroEntries(F));
-  if (!own_) PetscCall(stock_residual(t, x, x_t, F));
-  PetscCall(assembly_.residual(own_ ? Assembly::Part::all : Assembly::Part::facets, t, x, x_t, row_scale_.data(), F));
+  if (stock_loops()) PetscCall(stock_residual(t, x, x_t, F));
+  PetscCall(assembly_.residual(stock_loops() ? Assembly::Part::facets : Assembly::Part::all, t, x, x_t,
+                               row_scale_.data(), F));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -736,10 +770,10 @@ PetscErrorCode Model::create_matrix(Mat *A) const
 PetscErrorCode Model::jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, Mat A)
 {
   PetscFunctionBeginUser;
-  if (!own_) PetscCall(stock_jacobian(t, x, x_t, shift, A));
+  if (stock_loops()) PetscCall(stock_jacobian(t, x, x_t, shift, A));
   if (also_) PetscCall(also_->begin());
-  PetscCall(assembly_.jacobian(own_ ? Assembly::Part::all : Assembly::Part::facets, t, x, x_t, shift, row_scale_.data(),
-                               A, also_));
+  PetscCall(assembly_.jacobian(stock_loops() ? Assembly::Part::facets : Assembly::Part::all, t, x, x_t, shift,
+                               row_scale_.data(), A, also_));
   if (also_) {
     std::vector<PetscInt> closed;
     if (airway_held_)

@@ -222,11 +222,77 @@ PetscErrorCode Options::real(const std::string &name, const std::string &unit, R
   PetscFunctionBeginUser;
   PetscCall(find(name, number_text(value), unit, range.text(), help, raw, is_given));
   if (is_given) {
-    double number;
-    PetscCall(parse_number(full(name), raw, unit, range, number));
-    value = number;
+    drop_varying(value);
+    PetscCall(parse_varying(full(name), raw, unit, range, value));
   }
   PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Options::parse_varying(const std::string &option, const std::string &raw, const std::string &unit,
+                                      const Range &range, PetscReal &value)
+{
+  const std::vector<std::string> parts = split(raw, ',');
+  double number;
+  Varying varying;
+
+  PetscFunctionBeginUser;
+  if (raw.find('=') == std::string::npos) {
+    PetscCall(parse_number(option, raw, unit, range, number));
+    value = number;
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+  PulmoUserCheck(parts.front().find('=') == std::string::npos, comm_,
+                 "option %s begins with the value (%s) of all that is not named, e.g. 1,%s", option.c_str(),
+                 unit.c_str(), raw.c_str());
+  PetscCall(parse_number(option, parts.front(), unit, range, number));
+  value = number;
+  varying.option = option;
+  varying.unit = unit;
+  varying.text = raw;
+  varying.target = &value;
+  varying.everywhere = value;
+  for (std::size_t i = 1; i < parts.size(); ++i) {
+    const std::size_t equals = parts[i].rfind('=');
+    PulmoUserCheck(equals != std::string::npos && equals > 0, comm_,
+                   "option %s: '%s' is no name=value; give e.g. 1,right=2 with names of the mesh's volumes or surfaces",
+                   option.c_str(), parts[i].c_str());
+    const std::string name = parts[i].substr(0, equals);
+    PetscCall(parse_number(option + " (" + name + ")", parts[i].substr(equals + 1), unit, range, number));
+    for (const auto &other : varying.by_name)
+      PulmoUserCheck(other.first != name, comm_, "option %s names '%s' twice; leave one out", option.c_str(),
+                     name.c_str());
+    varying.by_name.emplace_back(name, number);
+  }
+  varying_.push_back(varying);
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+bool Options::varies(const PetscReal &value) const
+{
+  return std::any_of(varying_.begin(), varying_.end(), [&](const Varying &v) { return v.target == &value; });
+}
+
+void Options::hand_down(const PetscReal &from, PetscReal &to)
+{
+  to = from;
+  for (std::size_t i = 0, n = varying_.size(); i < n; ++i) {
+    if (varying_[i].target != &from) continue;
+    Varying copy = varying_[i];
+    copy.target = &to;
+    varying_.push_back(copy);
+  }
+}
+
+void Options::drop_varying(const PetscReal &value)
+{
+  varying_.erase(std::remove_if(varying_.begin(), varying_.end(), [&](const Varying &v) { return v.target == &value; }),
+                 varying_.end());
+}
+
+void Options::only_volumes(const PetscReal &value)
+{
+  for (Varying &v : varying_)
+    if (v.target == &value) v.surfaces = false;
 }
 
 PetscErrorCode Options::whole(const std::string &name, const std::string &unit, Range range, const std::string &help,

@@ -5,6 +5,7 @@
 #include "pulmo/errors.hpp"
 #include "pulmo/free_boundary.hpp"
 #include "pulmo/held.hpp"
+#include "pulmo/parameter_fields.hpp"
 #include "pulmo/units.hpp"
 
 #include <algorithm>
@@ -244,6 +245,9 @@ PetscErrorCode Run::setup()
   PetscCall(scene_.prepare(options_));
   Composition composition(scene_.mesh(), scene_.facts().elements);
   PetscCall(scene_.compose(composition));
+  auto fields = std::make_shared<ParameterFields>();
+  PetscCall(fields->setup(options_, composition));
+  if (!fields->empty()) composition.vary(fields);
   PetscCall(check_prescribed_once(composition));
   PetscCall(pin_free_motions(composition));
   PetscCall(model_.build(std::move(composition), reference_modulus(scene_.tissue().law())));

@@ -22,6 +22,8 @@ struct Measures {
   PetscMPIInt rank = 0;
 };
 
+class ParameterFields;
+
 /// Takes the element matrices of the cells while a Jacobian is assembled.
 class CellMatrices {
 public:
@@ -50,8 +52,9 @@ public:
   /// What is assembled: everything, or the facets only (cells are then PETSc's own affair).
   enum class Part { all, facets };
 
-  /// @p rate_ds: for PetscFE types other than pulmo's, the PetscDS of the auxiliary field that carries x_t.
-  PetscErrorCode setup(DM dm, PetscDS rate_ds);
+  /// @p rate_ds: for PetscFE types other than pulmo's, the PetscDS of the auxiliary field that carries x_t. @p varying:
+  /// parameters that differ from place to place, or null.
+  PetscErrorCode setup(DM dm, PetscDS rate_ds, const ParameterFields *varying);
 
   /// Adds the residual of the local vectors @p x and @p x_t to F; rows of field f are multiplied by row_scale[f].
   PetscErrorCode residual(Part part, PetscReal t, Vec x, Vec x_t, const PetscReal row_scale[], Vec F);
@@ -79,10 +82,13 @@ private:
 
   PetscErrorCode setup_cells();
   PetscErrorCode setup_facets();
+  PetscErrorCode setup_varying(const ParameterFields &fields);
   /// Gathers coefficients in blocks of cells, then of facets, integrates each block and scatters the results.
   template <class OnCells, class OnFacets, class Scatter>
   PetscErrorCode for_blocks(Part part, Vec x, Vec x_t, PetscInt result_size, OnCells &&on_cells, OnFacets &&on_facets,
                             Scatter &&scatter);
+  PetscInt places_per_call() const;
+  PetscErrorCode put_varying(const std::vector<PetscReal> &rows, PetscInt begin);
   PetscFEGeom block_geometry(PetscInt begin, PetscInt n);
   PetscErrorCode map_matrix(Mat A);
   PetscErrorCode add_to_matrix(PetscInt cell, const PetscScalar *matrix, const PetscReal row_scale[], Mat A);
@@ -100,6 +106,8 @@ private:
   std::vector<PetscReal> sample_weights_, relative_weights_;
   std::vector<Facets *> facets_;
   MatrixMap *map_ = nullptr;
+  VaryingConstants varying_;
+  std::vector<PetscReal> cell_constants_; ///< [cell][those that differ]
   IntegrationLog log_;
 };
 

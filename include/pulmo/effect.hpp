@@ -21,6 +21,7 @@
 namespace pulmo {
 
 class Mesh;
+class ParameterFields;
 
 /// A finite-element field: P1, P2, ... Lagrange on tetrahedra.
 struct FieldSpec {
@@ -190,7 +191,7 @@ public:
   void energy(Energy kind, const std::string &account, const std::string &surface, Callback<EnergyDensity> density)
   {
     energies_.push_back({effect_, kind, account, surface, density.function});
-    if (density.owner) readers_.push_back({effect_, account, density.owner});
+    if (density.owner) readers_.push_back({effect_, account, surface, density.owner});
   }
   void constrain(Constraint c)
   {
@@ -243,6 +244,14 @@ public:
   const std::vector<Constraint> &constraints() const { return constraints_; }
   const std::vector<EnergyTerm> &energies() const { return energies_; }
   const std::vector<ParameterBlock> &parameter_blocks() const { return parameters_; }
+  /// Parameters that differ from place to place, once all effects have spoken.
+  void vary(std::shared_ptr<const ParameterFields> fields) { varying_ = std::move(fields); }
+  /// Null where there are none.
+  const ParameterFields *varying() const { return varying_.get(); }
+  /// The place of @p parameter among the constants, or -1; @p owner: of its block.
+  PetscInt constant_at(const PetscReal *parameter, const char **owner) const;
+  /// The surfaces on which terms read the parameters of @p owner.
+  std::vector<std::string> surfaces_that_read(const char *owner) const;
   /// Refuses terms that read parameters which no effect hands over, or two hand over: an error in an effect's code.
   PetscErrorCode check_parameters(MPI_Comm comm) const;
   /// Constants of PetscDS for a step: those of the step and of all effects, under a directory.
@@ -267,7 +276,7 @@ private:
   {
     const auto fill = [&](const auto &slot) {
       slot.put(t);
-      if (slot.callback.owner) readers_.push_back({t.effect, t.name, slot.callback.owner});
+      if (slot.callback.owner) readers_.push_back({t.effect, t.name, t.surface, slot.callback.owner});
     };
     static_assert(sizeof...(Slots) > 0, "a term needs a callback: f0(...), f1(...), g0(...) ... g3(...)");
     (fill(slots), ...);
@@ -276,7 +285,7 @@ private:
 
   /// What reads a block of parameters.
   struct Reader {
-    std::string effect, term;
+    std::string effect, term, surface;
     const char *owner;
   };
 
@@ -290,6 +299,7 @@ private:
   std::vector<EnergyTerm> energies_;
   std::vector<ParameterBlock> parameters_;
   std::vector<Reader> readers_;
+  std::shared_ptr<const ParameterFields> varying_;
 };
 
 /// Pressure lost between ventilator and airway, after Rohrer: K1 Q + K2 |Q| Q with the flow Q in mm^3/s.

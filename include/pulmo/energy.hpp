@@ -53,7 +53,8 @@ public:
   const std::vector<EnergyBalance> &rows() const { return rows_; }
 
 private:
-  struct Part { ///< a surface, or the volume
+  struct Part {          ///< a surface, or the volume
+    std::string surface; ///< empty: the volume
     std::vector<Sampling::Element> elements;
     std::vector<const EnergyTerm *> terms;
     std::vector<std::size_t> account; ///< of each term

@@ -30,7 +30,8 @@ struct AcousticStiffness {
   PetscReal direction[3] = {0, 0, 0};
 };
 /// @p refine: search on around the softest of the directions tried.
-AcousticStiffness acoustic_stiffness(const TissueLaw &law, const PointState &state, bool refine = true);
+AcousticStiffness acoustic_stiffness(const TissueLaw &law, const PointState &state, bool refine = true,
+                                     const PetscScalar *constants = nullptr);
 
 /// dp/dJ of tissue that inflates freely, F = J^(1/3) I and p = dW/dJ, kPa: at zero or below nothing but what holds the
 /// lung from outside keeps it from going on by itself.

@@ -34,6 +34,17 @@ struct IntegrationLog {
   static PetscErrorCode find(PetscDS ds, IntegrationLog **log);
 };
 
+/// Constants of PetscDS that differ between the cells or facets of a call. Composed with the PetscDS under the name
+/// "pulmo_varying_constants".
+struct VaryingConstants {
+  std::vector<PetscInt> offsets;   ///< which of the constants
+  const PetscReal *rows = nullptr; ///< [place of the call][offset]: their values
+
+  static PetscErrorCode attach(PetscDS ds, VaryingConstants *varying);
+  /// Those of @p ds, or null.
+  static PetscErrorCode find(PetscDS ds, VaryingConstants **varying);
+};
+
 /// Registers the PetscFE type "pulmo".
 PetscErrorCode register_fe_type();
 

@@ -84,6 +84,10 @@ public:
   /// the sum of its displacement rows.
   PetscErrorCode reactions(Vec F, std::vector<std::array<PetscReal, 3>> &forces) const;
 
+  /// What kernels are told in a cell (of this rank, counted from 0), or on a facet of @p surface with that cell behind
+  /// it, since the last set_step(); good until the next call.
+  const PetscScalar *constants_at(PetscInt cell, const std::string &surface = "") const;
+
   PetscReal row_scale(PetscInt field) const { return row_scale_[field]; }
   PetscReal modulus() const { return modulus_; } ///< tissue stiffness that scales the equations, kPa
 
@@ -112,6 +116,8 @@ private:
   PetscErrorCode add_carrier(SectionHandle &section);
   PetscErrorCode pack_constants();
   PetscErrorCode add_volume_terms(PetscDS ds) const;
+  /// PETSc's own loops over cells: constants are the same everywhere there.
+  bool stock_loops() const { return !own_ && !composition().varying(); }
   PetscErrorCode create_stock();
   PetscErrorCode stock_residual(PetscReal t, Vec x, Vec x_t, Vec F);
   PetscErrorCode stock_jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, Mat A);
@@ -122,6 +128,7 @@ private:
   VecHandle rate_, scale_;
   std::vector<Prescribed> prescribed_;
   std::vector<PetscScalar> constants_;
+  mutable std::vector<PetscScalar> local_constants_; ///< of constants_at()
   std::vector<AirwayNode> airway_;
   std::vector<PetscInt> closed_rows_; ///< global rows of held nodes (or of the carrier) that this rank owns
   std::vector<PetscInt> idle_rows_;   ///< those of them that carry nothing

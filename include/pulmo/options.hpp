@@ -47,6 +47,7 @@ public:
   /// option given for it is an error that quotes @p enabled_by.
   void group(const std::string &name, const std::string &about, bool in_use = true, const std::string &enabled_by = "");
 
+  /// Also `0.36,right=0.7`: one number, and others for named parts of the mesh (varying(); @p value is the first).
   PetscErrorCode real(const std::string &name, const std::string &unit, Range range, const std::string &help,
                       PetscReal &value);
   PetscErrorCode whole(const std::string &name, const std::string &unit, Range range, const std::string &help,
@@ -60,6 +61,23 @@ public:
   PetscErrorCode names(const std::string &name, const std::string &help, std::vector<std::string> &value);
   /// Three numbers separated by commas.
   PetscErrorCode vector(const std::string &name, const std::string &unit, const std::string &help, PetscReal value[3]);
+
+  /// A number that was given with others for parts of the mesh.
+  struct Varying {
+    std::string option, unit, text; ///< text: as given
+    const PetscReal *target = nullptr;
+    PetscReal everywhere = 0;
+    std::vector<std::pair<std::string, PetscReal>> by_name;
+    bool surfaces = true; ///< names may be those of surfaces
+  };
+  /// Those read so far; ParameterFields finds a place for each, or refuses it.
+  const std::vector<Varying> &varying() const { return varying_; }
+  bool varies(const PetscReal &value) const;
+  /// What was read into @p from, a default of others, goes to @p to, too; call drop_varying(from) at the end.
+  void hand_down(const PetscReal &from, PetscReal &to);
+  void drop_varying(const PetscReal &value);
+  /// Lets only volumes be named for @p value.
+  void only_volumes(const PetscReal &value);
 
   /// Whether the user gave `-<group>_<name>` of the current group.
   PetscErrorCode given(const std::string &name, bool &is_given) const;
@@ -123,6 +141,8 @@ private:
   PetscErrorCode check_refused(const OptionList &given) const;
   PetscErrorCode parse_number(const std::string &option, const std::string &raw, const std::string &unit,
                               const Range &range, double &value) const;
+  PetscErrorCode parse_varying(const std::string &option, const std::string &raw, const std::string &unit,
+                               const Range &range, PetscReal &value);
   std::string full(const std::string &name) const;
   /// The declared option, or PETSc's option that pulmo knows, whose name is nearest; empty if all are further away
   /// than @p most letters.
@@ -134,6 +154,7 @@ private:
   MPI_Comm comm_;
   std::vector<Group> groups_;
   std::vector<Declared> declared_;
+  std::vector<Varying> varying_;
   OptionList sources_;
   std::set<std::string> told_; ///< options of which warn_unused() has warned
 };

@@ -194,42 +194,39 @@ inline PetscErrorCode set_from_options(TS ts)
 }
 
 #define PULMO_FE_ARGUMENTS                                                                                             \
-  PetscFormKey key, PetscInt n, PetscFEGeom *geom, const PetscScalar *u, const PetscScalar *u_t, PetscReal t,          \
-      PetscReal shift, PetscScalar *matrices
-#define PULMO_BD_ARGUMENTS                                                                                             \
   PetscFormKey key, PetscInt n, PetscFEGeom *geom, const PetscScalar *u, const PetscScalar *u_t, PetscDS aux,          \
       PetscReal t, PetscReal shift, PetscScalar *matrices
 #define PULMO_FE_TYPES                                                                                                 \
   PetscFormKey, PetscInt, PetscFEGeom *, const PetscScalar *, const PetscScalar *, PetscDS, const PetscScalar *,       \
       PetscReal, PetscReal, PetscScalar *
 
-/// PetscFEIntegrateJacobian: newer releases take a PetscDS for rows and one for columns.
+/// PetscFEIntegrateJacobian, with the rates as auxiliary field: newer releases take a PetscDS for rows and one for
+/// columns.
 inline PetscErrorCode integrate_jacobian(PetscErrorCode (*f)(PetscDS, PetscFEJacobianType, PULMO_FE_TYPES), PetscDS ds,
                                          PULMO_FE_ARGUMENTS)
 {
-  return f(ds, PETSCFE_JACOBIAN, key, n, geom, u, u_t, nullptr, nullptr, t, shift, matrices);
+  return f(ds, PETSCFE_JACOBIAN, key, n, geom, u, u_t, aux, u_t, t, shift, matrices);
 }
 inline PetscErrorCode integrate_jacobian(PetscErrorCode (*f)(PetscDS, PetscDS, PetscFEJacobianType, PULMO_FE_TYPES),
                                          PetscDS ds, PULMO_FE_ARGUMENTS)
 {
-  return f(ds, ds, PETSCFE_JACOBIAN, key, n, geom, u, u_t, nullptr, nullptr, t, shift, matrices);
+  return f(ds, ds, PETSCFE_JACOBIAN, key, n, geom, u, u_t, aux, u_t, t, shift, matrices);
 }
 
 /// PetscFEIntegrateBdJacobian, with the rates as auxiliary field: newer releases take the type of the Jacobian.
 inline PetscErrorCode integrate_bd_jacobian(PetscErrorCode (*f)(PetscDS, PetscWeakForm, PULMO_FE_TYPES), PetscDS ds,
-                                            PetscWeakForm wf, PULMO_BD_ARGUMENTS)
+                                            PetscWeakForm wf, PULMO_FE_ARGUMENTS)
 {
   return f(ds, wf, key, n, geom, u, u_t, aux, u_t, t, shift, matrices);
 }
 inline PetscErrorCode integrate_bd_jacobian(PetscErrorCode (*f)(PetscDS, PetscWeakForm, PetscFEJacobianType,
                                                                 PULMO_FE_TYPES),
-                                            PetscDS ds, PetscWeakForm wf, PULMO_BD_ARGUMENTS)
+                                            PetscDS ds, PetscWeakForm wf, PULMO_FE_ARGUMENTS)
 {
   return f(ds, wf, PETSCFE_JACOBIAN, key, n, geom, u, u_t, aux, u_t, t, shift, matrices);
 }
 
 #undef PULMO_FE_ARGUMENTS
-#undef PULMO_BD_ARGUMENTS
 #undef PULMO_FE_TYPES
 
 } // namespace compat

@@ -188,10 +188,13 @@ public:
   virtual Callback<EnergyDensity> numerical_callback() const = 0;
   /// Strain energy density W at a state, kPa.
   virtual PetscScalar energy(const PointState &state) const = 0;
-  /// P' = dW/dF at a state, kPa.
-  virtual void stress(const PointState &state, PetscScalar P[9]) const = 0;
-  /// dP'/dF at a state, kPa, stored [i][k][J][L].
-  virtual void tangent(const PointState &state, PetscScalar A[81]) const = 0;
+  /// P' = dW/dF at a state, kPa, with the parameters among @p constants (Model::constants_at), or the law's own if
+  /// null.
+  virtual void stress(const PointState &state, const PetscScalar *constants, PetscScalar P[9]) const = 0;
+  void stress(const PointState &state, PetscScalar P[9]) const { stress(state, nullptr, P); }
+  /// dP'/dF, kPa, stored [i][k][J][L].
+  virtual void tangent(const PointState &state, const PetscScalar *constants, PetscScalar A[81]) const = 0;
+  void tangent(const PointState &state, PetscScalar A[81]) const { tangent(state, nullptr, A); }
 };
 
 template <class Law>
@@ -214,18 +217,24 @@ public:
   Callback<EnergyDensity> stored_callback() const override { return energy_density<Parameters, Kernels::stored>; }
   Callback<EnergyDensity> numerical_callback() const override { return energy_density<Parameters, Kernels::numerical>; }
   PetscScalar energy(const PointState &state) const override { return Kernels::energy(state, parameters_); }
-  void stress(const PointState &state, PetscScalar P[9]) const override
+  using TissueLaw::stress;
+  using TissueLaw::tangent;
+  void stress(const PointState &state, const PetscScalar *constants, PetscScalar P[9]) const override
   {
     for (int i = 0; i < 9; ++i) P[i] = 0;
-    Kernels::stress(bare(state), parameters_, P);
+    Kernels::stress(bare(state), among(constants), P);
   }
-  void tangent(const PointState &state, PetscScalar A[81]) const override
+  void tangent(const PointState &state, const PetscScalar *constants, PetscScalar A[81]) const override
   {
     for (int i = 0; i < 81; ++i) A[i] = 0;
-    Kernels::tangent(bare(state), parameters_, A);
+    Kernels::tangent(bare(state), among(constants), A);
   }
 
 private:
+  Parameters among(const PetscScalar *constants) const
+  {
+    return constants ? constants::get<Parameters>(constants) : parameters_;
+  }
   static Point bare(const PointState &state) { return {state, nullptr, 0, nullptr, 0, 0, nullptr, nullptr, {}}; }
 
   Parameters parameters_;

@@ -113,11 +113,16 @@ public:
                    "-chest_wall_surfaces names more than %d surfaces; join some of them in the mesh",
                    static_cast<int>(ChestWallKernels::max_surfaces));
     for (std::size_t i = 0; i < surfaces_.size(); ++i) {
-      PetscReal own = common;
+      PetscReal &own = parameters_.stiffness[i];
+      bool given;
+      options.hand_down(common, own);
+      PetscCall(options.given("stiffness_" + surfaces_[i], given));
       PetscCall(options.real("stiffness_" + surfaces_[i], "kPa/mm", Range::not_negative(),
                              "K_s of surface " + surfaces_[i], own));
-      parameters_.stiffness[i] = own;
+      if (given) options.only_volumes(own);
+      varies_[i] = options.varies(own);
     }
+    options.drop_varying(common);
     parameters_.normal_only = direction_ == "normal";
     PetscFunctionReturn(PETSC_SUCCESS);
   }
@@ -141,7 +146,7 @@ public:
     PetscFunctionBeginUser;
     c.parameters(parameters_);
     for (std::size_t i = 0; i < surfaces_.size(); ++i) {
-      if (parameters_.stiffness[i] == 0) continue;
+      if (parameters_.stiffness[i] == 0 && !varies_[i]) continue;
       c.surface_residual("K_s u . eta", surfaces_[i], displacement, f0(residuals[i]));
       c.surface_jacobian("K_s", surfaces_[i], displacement, displacement, g0(jacobians[i]));
       c.energy(Energy::stored, "elastic_springs", surfaces_[i], stored[i]);
@@ -155,6 +160,7 @@ private:
   std::string direction_ = "full";
   std::vector<std::string> surfaces_{"pleura", "airway"};
   ChestWallKernels::Parameters parameters_{};
+  std::array<bool, ChestWallKernels::max_surfaces> varies_{}; ///< not the same all over a surface
 };
 
 } // namespace pulmo
