@@ -1,6 +1,5 @@
 """Pictures of what accuracy costs: convergence of the ladders, errors over time, dofs and memory, Pareto front, digits."""
 import numpy as np
-from matplotlib.ticker import LogLocator, NullFormatter
 
 from benchmarks.plots import plt, save
 
@@ -19,9 +18,9 @@ def logarithmic(axis, **labels):
     """Both axes logarithmic, with few labels where x spans little."""
     axis.set(xscale="log", yscale="log", **labels)
     low, high = axis.get_xlim()
-    axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 100 * low else (1,)))
+    axis.xaxis.set_major_locator(plt.LogLocator(subs=(1, 2, 5) if high < 100 * low else (1,)))
     axis.xaxis.set_major_formatter("{x:g}")
-    axis.xaxis.set_minor_formatter(NullFormatter())
+    axis.xaxis.set_minor_formatter(plt.NullFormatter())
     axis.tick_params(labelsize=8)
     axis.spines[["top", "right"]].set_visible(False)
 

@@ -1,11 +1,8 @@
 """The page of the gallery: table, list of what was missed, figures, CSV."""
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 
 from benchmarks.common import markdown, write_csv
+from benchmarks.plots import plt
 
 from .lab import pulmo
 from .laws import limit_point
