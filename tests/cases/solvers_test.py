@@ -3,6 +3,7 @@
 Krylov counts of the iterative files stay low whatever the permeability and the step.
 """
 import glob
+import itertools
 import os
 import unittest
 
@@ -22,6 +23,7 @@ SCENES = {
     "vcv without airflow": SPRINGS + VCV,
     "pcv on pins": ["-tissue", "yoshihara", "-support", "-support_rigid", "-airflow"] + PCV,
 }
+ON_TWO_RANKS = ("pcv", "vcv, common pressure", "pcv without airflow")
 
 
 def run(solver, options, ranks=1):
@@ -42,13 +44,14 @@ class Solvers(unittest.TestCase):
         self.assertGreaterEqual(len(solver_files()), 7)
         for name, options in SCENES.items():
             reference = run("tight.opts", options).signals()
-            for file in solver_files():
-                for ranks in (1, 2) if name in ("pcv", "vcv, common pressure", "pcv without airflow") else (1,):
-                    with self.subTest(scene=name, solver=file, ranks=ranks):
-                        signals = run(file, options, ranks).signals()
-                        for column in ("airway_pressure_cmH2O", "volume_ml"):
-                            error = np.abs(signals[column] - reference[column]).max()
-                            self.assertLess(error, 1e-6 * np.abs(reference[column]).max(), column)
+            for file, ranks in itertools.product(solver_files(), (1, 2) if name in ON_TWO_RANKS else (1,)):
+                if (file, ranks) == ("tight.opts", 1):
+                    continue  # the reference itself
+                with self.subTest(scene=name, solver=file, ranks=ranks):
+                    signals = run(file, options, ranks).signals()
+                    for column in ("airway_pressure_cmH2O", "volume_ml"):
+                        error = np.abs(signals[column] - reference[column]).max()
+                        self.assertLess(error, 1e-6 * np.abs(reference[column]).max(), column)
 
     def test_old_jacobians_cost_no_step(self):
         """Where a kept Jacobian serves badly or fails, new ones come before any step is cut."""
