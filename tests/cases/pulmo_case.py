@@ -163,6 +163,12 @@ def finished(options, **arguments):
     return case
 
 
+def has_ml():
+    """Whether this PETSc was built with ML: Debian 12's was, that of Debian 13 and later ones were not."""
+    said = Case(options_file("solvers/iterative_ml.opts") + ["-dm_plex_filename", scratch("none.msh")]).err
+    return "knows no 'ml'" not in said
+
+
 def main():
     """Takes the program and the launcher from the command line and runs the tests of the script."""
     global PROGRAM, LAUNCHER

@@ -67,8 +67,9 @@ class Unsolved(unittest.TestCase):
     def test_newton_in_other_forms(self):
         """They reach the state that newtonls reaches."""
         volume = pulmo.finished(PCV).signals()["volume_ml"]
-        for form in (["newtontr"], ["newtontrdc"], ["vinewtonrsls"], ["anderson", "-npc_snes_type", "newtonls"],
-                     ["ngmres", "-npc_snes_type", "newtonls"]):
+        # from 3.22 on PETSc takes the first radius as it is, 0.2 mm over all nodes: far too short
+        for form in (["newtontr", "-snes_tr_delta0", "100"], ["newtontrdc"], ["vinewtonrsls"],
+                     ["anderson", "-npc_snes_type", "newtonls"], ["ngmres", "-npc_snes_type", "newtonls"]):
             with self.subTest(form[0]):
                 case = pulmo.finished(PCV + ["-snes_type"] + form)
                 np.testing.assert_allclose(case.signals()["volume_ml"], volume, rtol=1e-6)
