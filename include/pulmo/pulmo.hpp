@@ -2,7 +2,7 @@
 /// The program as a function: what main() does after PetscInitialize. Tests call it with registries of their own.
 #pragma once
 
-#include "pulmo/simulation.hpp"
+#include "pulmo/time/simulation.hpp"
 
 namespace pulmo {
 

@@ -5,7 +5,7 @@
 //   mpiexec -n N pulmo_machine_benchmark [megabytes per array, default 128]
 //
 // Prints one JSON object, rates in 10^9 per second.
-#include "pulmo/simd.hpp"
+#include "pulmo/base/simd.hpp"
 
 #include <mpi.h>
 

@@ -1,8 +1,8 @@
 // The condition at the airway: modes, prescribed flux, the scalar equation of an unknown pressure and its Newton step.
 #include "unit/scenes.hpp"
 
-#include "pulmo/airway.hpp"
-#include "pulmo/units.hpp"
+#include "pulmo/base/units.hpp"
+#include "pulmo/time/airway.hpp"
 
 namespace pulmo::test {
 namespace {

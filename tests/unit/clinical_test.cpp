@@ -1,8 +1,8 @@
 // The clinical numbers, from signals made by hand.
 #include "unit/scenes.hpp"
 
-#include "pulmo/clinical.hpp"
-#include "pulmo/units.hpp"
+#include "pulmo/base/units.hpp"
+#include "pulmo/observers/clinical.hpp"
 
 namespace pulmo::test {
 namespace {

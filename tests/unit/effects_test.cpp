@@ -1,11 +1,11 @@
 // Kernels of the effects at one point: closed forms, and every Jacobian kernel against its residual kernel.
 #include "unit/tensors.hpp"
 
-#include "pulmo/effects/airflow.hpp"
-#include "pulmo/effects/chest_wall.hpp"
-#include "pulmo/effects/lumen_pressure.hpp"
-#include "pulmo/effects/traction.hpp"
-#include "pulmo/effects/ventilator.hpp"
+#include "pulmo/physics/effects/airflow.hpp"
+#include "pulmo/physics/effects/chest_wall.hpp"
+#include "pulmo/physics/effects/lumen_pressure.hpp"
+#include "pulmo/physics/effects/traction.hpp"
+#include "pulmo/physics/effects/ventilator.hpp"
 
 namespace pulmo::test {
 namespace {

@@ -1,6 +1,6 @@
 // Element pairs: where their nodes lie, and what is written of them.
-#include "pulmo/output.hpp"
-#include "pulmo/units.hpp"
+#include "pulmo/base/units.hpp"
+#include "pulmo/observers/output.hpp"
 #include "unit/scenes.hpp"
 #include "verification/support/fields.hpp"
 

@@ -2,7 +2,7 @@
 // Euler loses falls with the step.
 #include "unit/scenes.hpp"
 
-#include "pulmo/energy.hpp"
+#include "pulmo/observers/energy.hpp"
 
 #include <set>
 

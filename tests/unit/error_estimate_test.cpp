@@ -1,5 +1,5 @@
 // Error bars from differences between runs, on numbers whose limits are known.
-#include "pulmo/error_estimate.hpp"
+#include "pulmo/program/error_estimate.hpp"
 
 #include <cmath>
 #include <gtest/gtest.h>

@@ -1,5 +1,5 @@
 // The indicators of the error in space against the true errors of interpolated fields.
-#include "pulmo/error_indicator.hpp"
+#include "pulmo/observers/error_indicator.hpp"
 
 #include "unit/scenes.hpp"
 #include "verification/support/error_norms.hpp"

@@ -1,6 +1,6 @@
 // The acoustic tensor and the stiffness of free inflation against closed forms of the laws.
-#include "pulmo/failure.hpp"
-#include "pulmo/units.hpp"
+#include "pulmo/base/units.hpp"
+#include "pulmo/time/failure.hpp"
 #include "unit/tensors.hpp"
 
 namespace pulmo::test {

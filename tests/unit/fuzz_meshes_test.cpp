@@ -3,7 +3,7 @@
 // areas and volumes of the names, or the file is refused. PULMO_FUZZ=N writes N times as many files.
 #include "support/scene.hpp"
 
-#include "pulmo/msh.hpp"
+#include "pulmo/mesh/msh.hpp"
 
 #include <cmath>
 #include <cstdio>

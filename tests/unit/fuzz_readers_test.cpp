@@ -2,9 +2,9 @@
 // stack trace of PETSc's. PULMO_FUZZ=N mutates N times as many files (for the sanitizers).
 #include "support/scene.hpp"
 
-#include "pulmo/command_line.hpp"
-#include "pulmo/msh.hpp"
-#include "pulmo/programme.hpp"
+#include "pulmo/input/command_line.hpp"
+#include "pulmo/input/programme.hpp"
+#include "pulmo/mesh/msh.hpp"
 
 #include <algorithm>
 #include <cctype>

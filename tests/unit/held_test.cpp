@@ -1,5 +1,5 @@
 // What holds a lung: the rigid motions that are left free, pins against just these, values prescribed twice.
-#include "pulmo/pins.hpp"
+#include "pulmo/fem/pins.hpp"
 #include "support/scene.hpp"
 #include "unit/scenes.hpp"
 

@@ -1,7 +1,7 @@
 // Free inflation of an unstructured mesh through the whole program: F = J^1/3 I with p = dW/dJ, exact for P2.
 #include "unit/scenes.hpp"
 
-#include "pulmo/units.hpp"
+#include "pulmo/base/units.hpp"
 
 namespace pulmo::test {
 namespace {

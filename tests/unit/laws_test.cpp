@@ -1,8 +1,8 @@
 // The five tissue laws through the interface TissueLaw, against differences, symmetries and closed forms.
-#include "pulmo/registry.hpp"
+#include "pulmo/physics/registry.hpp"
 #include "unit/tensors.hpp"
 
-#include "pulmo/units.hpp"
+#include "pulmo/base/units.hpp"
 
 namespace pulmo::test {
 namespace {

@@ -1,8 +1,8 @@
 // The options database: parsing, ranges, mistakes that must end the run with a sentence that says how to fix it.
 #include "unit/scenes.hpp"
 
-#include "pulmo/effects/chest_wall.hpp"
-#include "pulmo/tissue/berger.hpp"
+#include "pulmo/physics/effects/chest_wall.hpp"
+#include "pulmo/physics/tissue/berger.hpp"
 
 namespace pulmo::test {
 namespace {

@@ -1,5 +1,5 @@
 // What options files can pick: rigid-body modes, p-multigrid, the fixed-stress matrix.
-#include "pulmo/single_blocks.hpp"
+#include "pulmo/solvers/single_blocks.hpp"
 #include "unit/scenes.hpp"
 
 namespace pulmo::test {

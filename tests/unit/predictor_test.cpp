@@ -1,7 +1,7 @@
 // What spares Newton work: the first guess of a step by least squares over past increments, and Jacobians that are
 // kept.
-#include "pulmo/lagging.hpp"
-#include "pulmo/predictor.hpp"
+#include "pulmo/solvers/lagging.hpp"
+#include "pulmo/time/predictor.hpp"
 #include "unit/scenes.hpp"
 
 namespace pulmo::test {

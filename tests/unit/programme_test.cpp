@@ -1,8 +1,8 @@
 // The ventilator's phases: from the options of each mode, and from files.
 #include "unit/scenes.hpp"
 
-#include "pulmo/effects/ventilator.hpp"
-#include "pulmo/units.hpp"
+#include "pulmo/base/units.hpp"
+#include "pulmo/physics/effects/ventilator.hpp"
 
 #include <fstream>
 #include <random>

@@ -1,7 +1,7 @@
 // Estimated errors of steps against the defect of the schemes' own formulas, which is exact for polynomials.
 #include "support/scene.hpp"
 
-#include "pulmo/step_control.hpp"
+#include "pulmo/time/step_control.hpp"
 
 #include <cmath>
 #include <functional>

@@ -2,7 +2,7 @@
 /// Small tensors, random deformations and numerical derivatives for the unit tests.
 #pragma once
 
-#include "pulmo/registry.hpp"
+#include "pulmo/physics/registry.hpp"
 
 #include <gtest/gtest.h>
 

@@ -1,8 +1,8 @@
 // Rates of what is conserved: exact for the polynomials of the scheme's order, and for the gas in a deformed cell.
 #include "unit/scenes.hpp"
 
-#include "pulmo/mesh.hpp"
-#include "pulmo/time_scheme.hpp"
+#include "pulmo/mesh/mesh.hpp"
+#include "pulmo/time/time_scheme.hpp"
 
 #include <petsc/private/tsimpl.h>
 

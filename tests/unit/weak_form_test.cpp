@@ -2,7 +2,7 @@
 // pulmo's integrator against PETSc's.
 #include "unit/scenes.hpp"
 
-#include "pulmo/effects/airflow.hpp"
+#include "pulmo/physics/effects/airflow.hpp"
 
 namespace pulmo::test {
 namespace {

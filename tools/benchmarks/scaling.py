@@ -127,7 +127,7 @@ def partition(pairs, cells, parts):
     metis = ctypes.CDLL("libmetis.so.5")
     settings = np.zeros(40, np.int32)  # METIS_NOPTIONS
     metis.METIS_SetDefaultOptions(settings.ctypes.data)
-    settings[8] = 1  # METIS_OPTION_SEED, as in src/partitioner.cpp
+    settings[8] = 1  # METIS_OPTION_SEED, as in src/mesh/partitioner.cpp
     ends = np.concatenate([pairs, pairs[:, ::-1]])
     ends = ends[np.argsort(ends[:, 0], kind="stable")]
     begin = np.zeros(cells + 1, np.int32)

@@ -1,5 +1,5 @@
 // Cryer's ball: pressed from all sides at once, drained at its surface; see README.md beside this file.
-#include "pulmo/units.hpp"
+#include "pulmo/base/units.hpp"
 #include "verification/support/history.hpp"
 #include "verification/support/lattice.hpp"
 #include "verification/support/refinement.hpp"

@@ -9,7 +9,7 @@
 //     z0                    traction   essential P N
 //     z1             z essential, else   flux    P N, Q.N
 //                           traction
-#include "pulmo/error_indicator.hpp"
+#include "pulmo/observers/error_indicator.hpp"
 #include "support/scene.hpp"
 #include "verification/mms/sources.hpp"
 #include "verification/support/error_norms.hpp"

@@ -1,11 +1,11 @@
 /// @file
-/// True errors of a computed state in the norms of the error indicators, as pulmo/error_indicator.hpp defines them.
+/// True errors of a computed state in the norms of the error indicators, as pulmo/observers/error_indicator.hpp defines them.
 #pragma once
 
 #include "verification/support/fields.hpp"
 
-#include "pulmo/tissue_law.hpp"
-#include "pulmo/units.hpp"
+#include "pulmo/physics/tissue_law.hpp"
+#include "pulmo/base/units.hpp"
 
 namespace pulmo::test {
 

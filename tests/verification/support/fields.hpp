@@ -2,7 +2,7 @@
 /// Values of a computed state at points of the cells, through PETSc's tabulations: nothing of pulmo's own integrator.
 #pragma once
 
-#include "pulmo/point.hpp"
+#include "pulmo/physics/point.hpp"
 
 #include <functional>
 #include <vector>

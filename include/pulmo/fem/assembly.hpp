@@ -1,0 +1,114 @@
+/// @file
+/// The loop over cells: gathers coefficients in blocks, integrates them through PetscFE, adds the element vectors
+/// and matrices. Positions in the sparse matrix are found once; no more than one block of element matrices exists.
+#pragma once
+
+#include "pulmo/base/petsc.hpp"
+#include "pulmo/fem/integration.hpp"
+#include "pulmo/physics/kinematics.hpp"
+
+#include <cstdint>
+#include <vector>
+
+namespace pulmo {
+
+/// What a state of the lung measures, over all ranks.
+struct Measures {
+  PetscReal volume_change = 0;    ///< int (J - 1) over the reference volume, mm^3
+  PetscReal min_J = 1, max_J = 1; ///< over quadrature points and cell corners
+  PetscReal min_J_points = 1;     ///< over quadrature points only
+  PetscReal where[3] = {0, 0, 0}; ///< material centroid of the cell with min_J, mm
+  PetscInt cell = -1;             ///< its number on rank @p rank
+  PetscMPIInt rank = 0;
+};
+
+class ParameterFields;
+
+/// Takes the element matrices of the cells while a Jacobian is assembled.
+class CellMatrices {
+public:
+  virtual ~CellMatrices() = default;
+  /// Begins a new Jacobian.
+  virtual PetscErrorCode begin() = 0;
+  /// Adds cell @p c (counted from 0) from its element matrix, rows scaled by @p row_scale.
+  virtual PetscErrorCode add(PetscInt c, const PetscScalar *matrix, const PetscReal row_scale[]) = 0;
+  /// Completes it; @p closed: mesh points whose pressure is held.
+  virtual PetscErrorCode end(const std::vector<PetscInt> &closed) = 0;
+};
+
+/// Assembly over the cells and named facets of a DM whose fields, PetscDS and sections are complete.
+class Assembly {
+public:
+  /// Cells per block: the element matrices of a block stay in the second-level cache.
+  static constexpr PetscInt block_cells = 32;
+  /// One block in so many is timed callback by callback.
+  static constexpr PetscInt timed_share = 16;
+
+  Assembly() = default;
+  ~Assembly();
+  Assembly(const Assembly &) = delete;
+  Assembly &operator=(const Assembly &) = delete;
+
+  /// What is assembled: everything, or the facets only (cells are then PETSc's own affair).
+  enum class Part { all, facets };
+
+  /// @p rate_ds: for PetscFE types other than pulmo's, the PetscDS of the auxiliary field that carries x_t. @p varying:
+  /// parameters that differ from place to place, or null.
+  PetscErrorCode setup(DM dm, PetscDS rate_ds, const ParameterFields *varying);
+
+  /// Adds the residual of the local vectors @p x and @p x_t to F; rows of field f are multiplied by row_scale[f].
+  PetscErrorCode residual(Part part, PetscReal t, Vec x, Vec x_t, const PetscReal row_scale[], Vec F);
+  /// A = dF/dx + shift dF/dx_t, rows scaled alike; Part::facets adds to A.
+  /// With @p also the element matrices of the cells go there too.
+  PetscErrorCode jacobian(Part part, PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[], Mat A,
+                          CellMatrices *also = nullptr);
+  /// J and its integral for the local vector @p x.
+  PetscErrorCode measure(Vec x, Measures &measures) const;
+  /// int cof F(x) : Grad y, the derivative of int (J - 1) in direction @p y, mm^3.
+  PetscErrorCode volume_derivative(Vec x, Vec y, PetscReal &derivative) const;
+
+  /// Kinematic states at the quadrature points, then the corners, of cell @p c (counted from 0).
+  void point_states(PetscInt c, const PetscScalar *x, std::vector<PointState> &states) const;
+  /// Weights of the quadrature points, summing to 1.
+  const std::vector<PetscReal> &relative_weights() const { return relative_weights_; }
+  PetscInt cells() const { return cells_; }
+  /// Offsets in the local vector of the dofs of cell @p c, field by field in the order of the basis.
+  const PetscInt *cell_dofs(PetscInt c) const { return &cell_dofs_[c * element_size_]; }
+  const IntegrationLog &log() const { return log_; }
+
+private:
+  struct Facets;
+  struct MatrixMap;
+
+  PetscErrorCode setup_cells();
+  PetscErrorCode setup_facets();
+  PetscErrorCode setup_varying(const ParameterFields &fields);
+  /// Gathers coefficients in blocks of cells, then of facets, integrates each block and scatters the results.
+  template <class OnCells, class OnFacets, class Scatter>
+  PetscErrorCode for_blocks(Part part, Vec x, Vec x_t, PetscInt result_size, OnCells &&on_cells, OnFacets &&on_facets,
+                            Scatter &&scatter);
+  PetscInt places_per_call() const;
+  PetscErrorCode put_varying(const std::vector<PetscReal> &rows, PetscInt begin);
+  PetscFEGeom block_geometry(PetscInt begin, PetscInt n);
+  PetscErrorCode map_matrix(Mat A);
+  PetscErrorCode add_to_matrix(PetscInt cell, const PetscScalar *matrix, const PetscReal row_scale[], Mat A);
+
+  DM dm_ = nullptr; ///< not owned
+  PetscDS ds_ = nullptr, rate_ds_ = nullptr;
+  PetscInt n_fields_ = 0, cells_ = 0, first_cell_ = 0, element_size_ = 0, points_per_cell_ = 0;
+  std::vector<PetscInt> cell_dofs_;   ///< [cell][element_size]: offset in the local vector
+  std::vector<PetscInt> cell_points_; ///< [cell][points_per_cell]: mesh points that carry dofs
+  std::vector<PetscInt> dof_point_;   ///< [element_size]: which of these points a dof of the element belongs to
+  std::vector<PetscInt> dof_field_;   ///< [element_size]
+  std::vector<PetscReal> v0_, J_, invJ_, detJ_;
+  std::vector<PetscReal> sample_gradients_; ///< d(basis)/d(xi) at quadrature points, then corners: [point][node][3]
+  PetscInt sample_points_ = 0, nodes_ = 0;
+  std::vector<PetscReal> sample_weights_, relative_weights_;
+  std::vector<Facets *> facets_;
+  MatrixMap *map_ = nullptr;
+  VaryingConstants varying_;
+  std::vector<PetscReal> cell_constants_; ///< [cell][those that differ]
+  IntegrationLog log_;
+};
+
+} // namespace pulmo

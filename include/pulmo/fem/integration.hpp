@@ -1,0 +1,51 @@
+/// @file
+/// pulmo's own PetscFE type: the pointwise callbacks of PetscDS, integrated fast.
+///
+/// `-petscfe_type pulmo` (the default) differs from PETSc's `basic` only in how it computes: basis functions are
+/// tabulated once per scalar node, the kinematic state of a quadrature point is made once for all callbacks, all
+/// field pairs are done in one pass, and element matrices are built in blocks of components by one small dense
+/// product over all quadrature points. Both give the same numbers (tests/unit, `tools/benchmark assembly`).
+///
+/// Because all fields are done in one pass, the type works when asked for field 0 and returns at once for the
+/// others; PETSc's own loops over fields remain correct.
+#pragma once
+
+#include "pulmo/base/petsc.hpp"
+
+#include <map>
+#include <string>
+#include <vector>
+
+namespace pulmo {
+
+/// What the integrator counts. Composed with the PetscDS under the name "pulmo_integration_log".
+struct IntegrationLog {
+  bool timing = false;          ///< whether the block of cells at hand is timed
+  long long residual_calls = 0; ///< volume callbacks called in residuals, over all points
+  long long residual_cells = 0; ///< cells in those residuals
+  long long jacobian_calls = 0; ///< the same for Jacobians
+  long long jacobian_cells = 0;
+  long long timed_cells = 0;                ///< cells of the timed blocks, of residuals and Jacobians
+  std::map<void (*)(void), double> seconds; ///< of each callback in what was timed: some blocks of cells, all facets
+
+  /// Makes @p log known to the integrator of @p ds.
+  static PetscErrorCode attach(PetscDS ds, IntegrationLog *log);
+  /// The log of @p ds, or null.
+  static PetscErrorCode find(PetscDS ds, IntegrationLog **log);
+};
+
+/// Constants of PetscDS that differ between the cells or facets of a call. Composed with the PetscDS under the name
+/// "pulmo_varying_constants".
+struct VaryingConstants {
+  std::vector<PetscInt> offsets;   ///< which of the constants
+  const PetscReal *rows = nullptr; ///< [place of the call][offset]: their values
+
+  static PetscErrorCode attach(PetscDS ds, VaryingConstants *varying);
+  /// Those of @p ds, or null.
+  static PetscErrorCode find(PetscDS ds, VaryingConstants **varying);
+};
+
+/// Registers the PetscFE type "pulmo".
+PetscErrorCode register_fe_type();
+
+} // namespace pulmo

@@ -1,0 +1,68 @@
+/// @file
+/// States of the lung at quadrature points of cells and of named surfaces, for observers that integrate over them.
+#pragma once
+
+#include "pulmo/fem/model.hpp"
+
+namespace pulmo {
+
+/// A state at one point.
+struct Sample {
+  PointState state;
+  PetscReal x[3];                       ///< material coordinates, mm
+  PetscScalar u[3];                     ///< mm
+  PetscScalar p;                        ///< kPa (airflow only)
+  PetscScalar grad_p[3];                ///< kPa/mm (airflow only)
+  PetscScalar u_t[3], p_t, grad_p_t[3]; ///< rates, as that in the state: of make_rates(), else 0
+};
+
+/// The points of the model's own rules, so that integrals match the weak form term by term.
+class Sampling {
+public:
+  /// A cell, or a facet with the cell behind it.
+  struct Element {
+    PetscInt cell;         ///< on this rank, counted from 0
+    PetscInt table;        ///< which of the rules: 0 that of cells, then those of the faces
+    PetscReal measure;     ///< volume or area, reference configuration, mm^3 or mm^2
+    PetscReal normal[3];   ///< outward unit normal (facets only)
+    PetscReal v0[3], J[9]; ///< x = v0 + J (xi + 1)
+    PetscReal inverse[9];  ///< of J
+  };
+
+  PetscErrorCode setup(const Model &model);
+  /// All cells of this rank.
+  const std::vector<Element> &cells() const { return cells_; }
+  /// The facets of a named surface.
+  PetscErrorCode surface(const Mesh &mesh, const std::string &name, std::vector<Element> &facets) const;
+  /// Weights of the points of @p element, summing to its measure when multiplied with it.
+  const std::vector<PetscReal> &weights(const Element &element) const { return tables_[element.table].weights; }
+  /// States at the points of @p element for the local vector @p x.
+  void sample(const Element &element, const PetscScalar *x, std::vector<Sample> &samples) const;
+  /// Gives @p now the rates that backward Euler finds in it after @p before, @p dt seconds earlier.
+  static void make_rates(const Sample &before, PetscReal dt, Sample &now);
+  /// A sample as kernels see it.
+  Point point(const Sample &sample, const Element &element, PetscReal t, const Step &step) const
+  {
+    return {sample.state, sample.u,   sample.p,   gas_ ? sample.grad_p : nullptr,  t, 0, sample.x, element.normal,
+            step,         sample.u_t, sample.p_t, gas_ ? sample.grad_p_t : nullptr};
+  }
+
+private:
+  /// Basis functions at the points of a rule on the reference cell.
+  struct Table {
+    std::vector<PetscReal> weights, xi; ///< weights sum to 1
+    std::vector<PetscReal> u, du;       ///< [point][node], [point][node][3], by xi
+    std::vector<PetscReal> p, dp;
+  };
+
+  PetscErrorCode add_table(const std::vector<PetscReal> &xi, const std::vector<PetscReal> &weights);
+
+  DM dm_ = nullptr; ///< not owned
+  const Assembly *assembly_ = nullptr;
+  bool gas_ = false;
+  PetscInt nodes_ = 0, corners_ = 0;
+  std::vector<Table> tables_; ///< of the cell, then of the faces opposite its corners
+  std::vector<Element> cells_;
+};
+
+} // namespace pulmo

@@ -1,0 +1,57 @@
+/// @file
+/// Numerical error bars of the clinical numbers: what they are made of, and how they are listed.
+#pragma once
+
+#include "pulmo/observers/clinical.hpp"
+
+#include <petscsys.h>
+
+namespace pulmo {
+
+/// What the steps make a number wrong by.
+struct TimeError {
+  double error;                ///< in the number's unit, not negative
+  std::optional<double> order; ///< observed; none where the numbers do not approach a limit in one direction
+};
+
+/// Error in time of @p fine (steps dt) from the same number with steps 2 dt and 4 dt, by a scheme of order @p order:
+/// Richardson's extrapolation with the factors of safety of Oberkampf & Roy 2010 (Verification and Validation in
+/// Scientific Computing, section 8.6): 1.25 where the observed order is the scheme's within 10 %, else 3 with the
+/// observed order, but not below 1/2 nor above the scheme's. Without an order: 1.25 times the largest difference seen.
+TimeError time_error(double fine, double twice, double four_times, int order);
+
+/// Error in space from the difference @p difference to the same number on a mesh of cells @p ratio times as large
+/// (above or below 1). Of order 1, as rims and edges leave it, with a factor of safety of 1.25: 2.5 times the
+/// difference to a mesh refined once, 1.25 times that to one twice as coarse.
+double space_error(double difference, double ratio);
+
+/// A clinical number with what the discretisation makes it wrong by, each part in the number's unit. A part that could
+/// not be had is empty.
+struct ErrorBar {
+  ClinicalEntry entry;
+  std::optional<double> time, space, solver;
+  std::optional<double> time_order; ///< observed
+
+  /// The sum of the parts (they may all point the same way); empty if one is missing.
+  std::optional<double> total() const;
+};
+
+/// One run that the estimate was made from.
+struct ErrorLevel {
+  std::string name;    ///< what is different from the run itself
+  std::string failure; ///< why it has no numbers; empty if it finished
+  PetscReal dt = 0;    ///< s; the first steps' if steps are chosen by their error
+  PetscInt cells = 0, dofs = 0, steps = 0;
+  double volume = 0;  ///< at rest, ml
+  double seconds = 0; ///< wall
+  std::vector<ClinicalEntry> numbers;
+};
+
+/// What an estimate found.
+struct ErrorReport {
+  std::vector<ErrorBar> bars;     ///< one for each clinical number that the run has
+  std::vector<ErrorLevel> levels; ///< the run itself comes first
+  double extra_seconds() const;   ///< wall, what the estimate took
+};
+
+} // namespace pulmo

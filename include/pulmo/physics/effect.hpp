@@ -1,0 +1,377 @@
+/// @file
+/// What an effect is: options, fields, weak-form terms, constraints, declared in one header in pulmo/physics/effects/.
+///
+/// An effect that a scene does not ask for only lists its options; it adds no field, no term, no matrix block.
+#pragma once
+
+#include "pulmo/input/programme.hpp"
+#include "pulmo/mesh/elements.hpp"
+#include "pulmo/physics/permeability.hpp"
+#include "pulmo/physics/point.hpp"
+#include "pulmo/physics/tissue_law.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <functional>
+#include <memory>
+#include <optional>
+#include <string>
+#include <vector>
+
+namespace pulmo {
+
+class Mesh;
+class ParameterFields;
+
+/// A finite-element field: P1, P2, ... Lagrange on tetrahedra.
+struct FieldSpec {
+  std::string name;
+  PetscInt components;
+  PetscInt degree;
+  std::string unit;
+  std::string effect; ///< who brought it
+};
+
+/// One term of the weak form: callbacks of one residual row, or of one Jacobian block.
+struct Term {
+  std::string effect, name;
+  std::string surface; ///< empty: the whole volume
+  PetscInt test = displacement;
+  PetscInt trial = -1; ///< -1: a residual term
+  PetscPointFunc f0 = nullptr, f1 = nullptr;
+  PetscPointJac g0 = nullptr, g1 = nullptr, g2 = nullptr, g3 = nullptr;
+  PetscBdPointFunc bd_f0 = nullptr, bd_f1 = nullptr;
+  PetscBdPointJac bd_g0 = nullptr, bd_g1 = nullptr, bd_g2 = nullptr, bd_g3 = nullptr;
+};
+
+/// A callback in its place in a term.
+template <class F, PetscInt Order>
+struct Slot {
+  Callback<F> callback;
+
+  void put(Term &t) const
+  {
+    if constexpr (std::is_same_v<F, PetscPointFunc>)
+      (Order == 0 ? t.f0 : t.f1) = callback.function;
+    else if constexpr (std::is_same_v<F, PetscBdPointFunc>)
+      (Order == 0 ? t.bd_f0 : t.bd_f1) = callback.function;
+    else if constexpr (std::is_same_v<F, PetscPointJac>)
+      (Order == 0 ? t.g0 : Order == 1 ? t.g1 : Order == 2 ? t.g2 : t.g3) = callback.function;
+    else
+      (Order == 0 ? t.bd_g0 : Order == 1 ? t.bd_g1 : Order == 2 ? t.bd_g2 : t.bd_g3) = callback.function;
+  }
+};
+
+// residual: f0 . q + f1 : Grad q; Jacobian: g0 by value and value, g1 by Grad of the trial field, g2 of the test field,
+// g3 of both (pulmo/physics/point.hpp)
+template <class F>
+Slot<F, 0> f0(Callback<F> c)
+{
+  return {c};
+}
+template <class F>
+Slot<F, 1> f1(Callback<F> c)
+{
+  return {c};
+}
+template <class F>
+Slot<F, 0> g0(Callback<F> c)
+{
+  return {c};
+}
+template <class F>
+Slot<F, 1> g1(Callback<F> c)
+{
+  return {c};
+}
+template <class F>
+Slot<F, 2> g2(Callback<F> c)
+{
+  return {c};
+}
+template <class F>
+Slot<F, 3> g3(Callback<F> c)
+{
+  return {c};
+}
+
+/// Prescribed values of some components of a field, on a surface or at single vertices.
+struct Constraint {
+  std::string effect, name;
+  PetscInt field = displacement;
+  bool component[3] = {false, false, false};
+  std::string surface;            ///< empty: at @p vertices
+  std::vector<PetscInt> vertices; ///< local mesh points (on every rank that has them)
+  bool at_airway = false;         ///< steered by the ventilator: its pressure while it holds one, else free
+  PetscInt pinned_body = -1;      ///< the body of Mesh::bodies() that this pins against a rigid motion; -1: no pin
+  /// Value of all components at time t (s) and material point x (mm); unused if at_airway.
+  std::function<void(PetscReal t, const PetscReal x[3], PetscScalar value[3])> value;
+};
+
+/// Where energy goes in the balance  work of the ventilator + external = stored + dissipated + numerical.
+enum class Energy { external, stored, dissipated, numerical };
+
+/// A share of the energy balance: what happens to energy in a step, point by point (pulmo/observers/energy.hpp).
+struct EnergyTerm {
+  std::string effect;
+  Energy kind;
+  std::string account; ///< the row that it adds to, as in summary.json
+  std::string surface; ///< empty: the whole volume
+  EnergyDensity density;
+};
+
+/// What backward Euler loses between the gas and the tissue: p (dJ - cof F : dF), kPa. The ventilator pays for the
+/// whole change of volume, the tissue gets the work of its gas stress, which is linear in the step.
+static inline PetscScalar numerical_gas_loss(const Point &now, const Point &before, const NoParameters &)
+{
+  PetscScalar D[9];
+  for (int i = 0; i < 9; ++i) D[i] = now.state.H[i] - before.state.H[i];
+  return now.gas_pressure() * volume_beyond_linear(now.state.F, D);
+}
+
+/// A block of kernel parameters that lives in an effect and is copied into PetscDS before each evaluation.
+struct ParameterBlock {
+  const char *owner;
+  const PetscScalar *data;
+  PetscInt count;
+};
+
+/// What the effects of a scene put together; filled by Effect::fields and Effect::terms.
+class Composition {
+public:
+  Composition(const Mesh &mesh, const Elements &elements) : mesh_(mesh), elements_(elements) {}
+
+  const Mesh &mesh() const { return mesh_; }
+  const Elements &elements() const { return elements_; }
+  /// Names the effect that speaks next (used by the ledger).
+  void speaker(const std::string &effect) { effect_ = effect; }
+
+  void field(const std::string &name, PetscInt components, PetscInt degree, const std::string &unit)
+  {
+    fields_.push_back({name, components, degree, unit, effect_});
+  }
+
+  /// Hands a struct of parameters to the kernels. The struct must outlive the model.
+  template <class P>
+  void parameters(const P &p)
+  {
+    parameters(P::owner, reinterpret_cast<const PetscScalar *>(&p), sizeof(P) / sizeof(PetscScalar));
+  }
+  void parameters(const char *owner, const PetscScalar *data, PetscInt count)
+  {
+    parameters_.push_back({owner, data, count});
+  }
+
+  /// A residual term of the volume, e.g. residual("P : Grad eta", displacement, f1(volume_residual<P, K::stress>)).
+  template <class... Slots>
+  void residual(const std::string &name, PetscInt test, Slots... slots)
+  {
+    add(term(name, "", test, -1), slots...);
+  }
+  /// A Jacobian term of the volume: of the row @p test by the field @p trial.
+  template <class... Slots>
+  void jacobian(const std::string &name, PetscInt test, PetscInt trial, Slots... slots)
+  {
+    add(term(name, "", test, trial), slots...);
+  }
+  template <class... Slots>
+  void surface_residual(const std::string &name, const std::string &surface, PetscInt test, Slots... slots)
+  {
+    add(term(name, surface, test, -1), slots...);
+  }
+  template <class... Slots>
+  void surface_jacobian(const std::string &name, const std::string &surface, PetscInt test, PetscInt trial,
+                        Slots... slots)
+  {
+    add(term(name, surface, test, trial), slots...);
+  }
+  /// A term of the energy balance: work done on the lung in a step (external), growth of a stored energy, energy
+  /// turned to heat (dissipated), and what backward Euler loses beside these: work of the term's force at the end of
+  /// the step along the step, less what is stored (numerical).
+  void energy(Energy kind, const std::string &account, const std::string &surface, Callback<EnergyDensity> density)
+  {
+    energies_.push_back({effect_, kind, account, surface, density.function});
+    if (density.owner) readers_.push_back({effect_, account, surface, density.owner});
+  }
+  void constrain(Constraint c)
+  {
+    c.effect = effect_;
+    constraints_.push_back(std::move(c));
+  }
+  /// The uniform gas pressure of a lung without airflow is an unknown in some phases.
+  void solve_for_gas_pressure() { common_gas_pressure_ = true; }
+  bool common_gas_pressure() const { return common_gas_pressure_; }
+
+  /// Whether displacement is prescribed anywhere.
+  bool supported() const
+  {
+    for (const Constraint &c : constraints_)
+      if (c.field == displacement) return true;
+    return false;
+  }
+  /// Asks for pins against the rigid motions that nothing else holds, once all effects have spoken.
+  void pin_free_motions() { pins_for_ = effect_; }
+  /// The effect that asked for them, or nothing.
+  const std::string &pins_for() const { return pins_for_; }
+  bool pinned() const
+  {
+    return std::any_of(constraints_.begin(), constraints_.end(),
+                       [](const Constraint &c) { return c.pinned_body >= 0; });
+  }
+
+  /// The surfaces where something bears a load: a prescribed displacement, or a term that resists displacement itself;
+  /// an empty name stands for all of the lung. Pins at single vertices bear none.
+  std::vector<std::string> bearing_surfaces() const
+  {
+    std::vector<std::string> list;
+    for (const Constraint &c : constraints_)
+      if (c.field == displacement && !c.surface.empty()) list.push_back(c.surface);
+    for (const Term &t : terms_)
+      if (resists(t)) list.push_back(t.surface);
+    return list;
+  }
+  /// The surfaces on which an effect has terms.
+  std::vector<std::string> surfaces_of(const std::string &effect) const
+  {
+    std::vector<std::string> list;
+    for (const Term &t : terms_)
+      if (t.effect == effect && !t.surface.empty()) list.push_back(t.surface);
+    return list;
+  }
+
+  const std::vector<FieldSpec> &fields() const { return fields_; }
+  const std::vector<Term> &terms() const { return terms_; }
+  const std::vector<Constraint> &constraints() const { return constraints_; }
+  const std::vector<EnergyTerm> &energies() const { return energies_; }
+  const std::vector<ParameterBlock> &parameter_blocks() const { return parameters_; }
+  /// Parameters that differ from place to place, once all effects have spoken.
+  void vary(std::shared_ptr<const ParameterFields> fields) { varying_ = std::move(fields); }
+  /// Null where there are none.
+  const ParameterFields *varying() const { return varying_.get(); }
+  /// The place of @p parameter among the constants, or -1; @p owner: of its block.
+  PetscInt constant_at(const PetscReal *parameter, const char **owner) const;
+  /// The surfaces on which terms read the parameters of @p owner.
+  std::vector<std::string> surfaces_that_read(const char *owner) const;
+  /// Refuses terms that read parameters which no effect hands over, or two hand over: an error in an effect's code.
+  PetscErrorCode check_parameters(MPI_Comm comm) const;
+  /// Constants of PetscDS for a step: those of the step and of all effects, under a directory.
+  std::vector<PetscScalar> constants(const Step &step) const;
+
+private:
+  /// Whether a term resists displacement itself.
+  static bool resists(const Term &t) { return t.test == displacement && t.trial == displacement && (t.g0 || t.bd_g0); }
+  Term term(const std::string &name, const std::string &surface, PetscInt test, PetscInt trial) const
+  {
+    Term t;
+    t.effect = effect_;
+    t.name = name;
+    t.surface = surface;
+    t.test = test;
+    t.trial = trial;
+    return t;
+  }
+
+  template <class... Slots>
+  void add(Term t, Slots... slots)
+  {
+    const auto fill = [&](const auto &slot) {
+      slot.put(t);
+      if (slot.callback.owner) readers_.push_back({t.effect, t.name, t.surface, slot.callback.owner});
+    };
+    static_assert(sizeof...(Slots) > 0, "a term needs a callback: f0(...), f1(...), g0(...) ... g3(...)");
+    (fill(slots), ...);
+    terms_.push_back(std::move(t));
+  }
+
+  /// What reads a block of parameters.
+  struct Reader {
+    std::string effect, term, surface;
+    const char *owner;
+  };
+
+  const Mesh &mesh_;
+  Elements elements_;
+  std::string effect_, pins_for_;
+  bool common_gas_pressure_ = false;
+  std::vector<FieldSpec> fields_;
+  std::vector<Term> terms_;
+  std::vector<Constraint> constraints_;
+  std::vector<EnergyTerm> energies_;
+  std::vector<ParameterBlock> parameters_;
+  std::vector<Reader> readers_;
+  std::shared_ptr<const ParameterFields> varying_;
+};
+
+/// Pressure lost between ventilator and airway, after Rohrer: K1 Q + K2 |Q| Q with the flow Q in mm^3/s.
+struct AirwayResistance {
+  PetscReal linear = 0;    ///< K1, kPa s/mm^3
+  PetscReal quadratic = 0; ///< K2, kPa s^2/mm^6
+
+  PetscReal drop(PetscReal flow) const { return (linear + quadratic * std::abs(flow)) * flow; }
+  PetscReal slope(PetscReal flow) const { return linear + 2 * quadratic * std::abs(flow); }
+};
+
+/// How the flow of a flow phase is shared by the airway patches.
+enum class FlowSplit {
+  automatic,      ///< not said: uniform where the airway is one patch, else common_pressure (Scene::prepare)
+  uniform,        ///< the same flux through every element of area (Aviles-Rojas & Hurtado 2022, eq. 45)
+  common_pressure ///< so that all patches have one pressure, which is unknown until solved
+};
+
+/// What comes before the first breath where PEEP or a load moves the lung at rest.
+struct Settling {
+  std::shared_ptr<const Programme> programme; ///< the ventilator's with a phase `settle` first; null: that is no matter
+  bool off = false;                           ///< loads that move the lung at rest are counted as breath
+  bool pressure = false;                      ///< so is the pressure that the airway begins with
+};
+
+/// What one effect may know of the scene beside itself.
+struct SceneFacts {
+  Elements elements;
+  bool airflow = false;                        ///< the pressure field exists
+  std::vector<std::string> airway_surfaces;    ///< open to the ventilator; without airflow those that would be
+  std::shared_ptr<const Programme> ventilator; ///< null without a ventilator
+  Settling settling;
+  FlowSplit flow_split = FlowSplit::automatic;
+  std::optional<AirwayResistance> tube; ///< between ventilator and airway
+  bool pressure_damping = false;        ///< oscillations of the pressure are damped
+
+  /// Whether some phase leaves the airway's pressure field free, with its flux prescribed.
+  bool free_airway() const
+  {
+    return airflow && ventilator && ventilator->prescribes_flow() && flow_split == FlowSplit::uniform;
+  }
+  /// Whether some phase has one pressure of the whole airway (without airflow: of all gas) as an unknown of its own.
+  bool common_pressure() const
+  {
+    return ventilator && (tube || ventilator->limits_pressure() || (ventilator->prescribes_flow() && !free_airway()));
+  }
+};
+
+/// One physical effect.
+class Effect {
+public:
+  virtual ~Effect() = default;
+
+  /// The option prefix, and the owner of its parameters.
+  virtual const char *name() const = 0;
+  /// One line for -help and the ledger: what it is and where it is published.
+  virtual const char *about() const = 0;
+  /// Declares all options, whether or not the scene asks for the effect, and learns whether it does.
+  virtual PetscErrorCode declare(Options &options) = 0;
+  /// Whether the scene asks for it (after declare()).
+  virtual bool active() const = 0;
+  /// Tells the other effects what they may need to know.
+  virtual PetscErrorCode announce(SceneFacts &) { return PETSC_SUCCESS; }
+  /// For an effect that is on by default where others are: they have announced themselves, the mesh is read, active()
+  /// is asked next.
+  virtual PetscErrorCode consider(Options &, const Mesh &, const SceneFacts &) { return PETSC_SUCCESS; }
+  /// Checks against the mesh and the other effects; errors name the option and how to fix it.
+  virtual PetscErrorCode check(const Options &, const Mesh &, const SceneFacts &) { return PETSC_SUCCESS; }
+  /// Adds its fields.
+  virtual void fields(Composition &) const {}
+  /// Adds its parameters, terms and constraints.
+  virtual PetscErrorCode terms(Composition &, const SceneFacts &) const { return PETSC_SUCCESS; }
+};
+
+} // namespace pulmo

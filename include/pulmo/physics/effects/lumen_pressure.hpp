@@ -1,0 +1,128 @@
+/// @file
+/// Effect `lumen_pressure`: the gas in the airway presses on the airway wall.
+///
+/// Without it the total traction on the airway is the spring alone, as in the paper. With it the traction
+/// gains -p J F^-T N, with the local field p on the surface (the uniform gas pressure without airflow).
+/// It is on by default wherever there is a ventilator. (Without one the airway is at atmospheric pressure, p = 0.)
+#pragma once
+
+#include "pulmo/mesh/mesh.hpp"
+#include "pulmo/physics/effect.hpp"
+
+#include <algorithm>
+
+namespace pulmo {
+
+struct LumenPressureKernels {
+  /// f0 = p cof F N.
+  static void wall(const Point &point, const NoParameters &, PetscScalar f0[])
+  {
+    const PetscScalar p = point.gas_pressure(), *cof = point.state.cof_F;
+    const PetscReal *N = point.normal;
+    for (int i = 0; i < 3; ++i) f0[i] += p * (cof[3 * i] * N[0] + cof[3 * i + 1] * N[1] + cof[3 * i + 2] * N[2]);
+  }
+  /// g1 = p d(cof F N)/dF.
+  static void wall_by_displacement(const Point &point, const NoParameters &, PetscScalar g1[])
+  {
+    PetscScalar g3[81] = {0};
+    const PetscReal *N = point.normal;
+    add_cofactor_derivative(point.state.F, point.gas_pressure(), g3);
+    for (int ik = 0; ik < 9; ++ik)
+      for (int L = 0; L < 3; ++L)
+        g1[3 * ik + L] += g3[9 * ik + L] * N[0] + g3[9 * ik + 3 + L] * N[1] + g3[9 * ik + 6 + L] * N[2];
+  }
+  /// g0 = cof F N.
+  static void wall_by_pressure(const Point &point, const NoParameters &, PetscScalar g0[])
+  {
+    const PetscScalar *cof = point.state.cof_F;
+    const PetscReal *N = point.normal;
+    for (int i = 0; i < 3; ++i) g0[i] += (cof[3 * i] * N[0] + cof[3 * i + 1] * N[1] + cof[3 * i + 2] * N[2]);
+  }
+  /// Work of the wall pressure on the lung in a step: -p cof F N . du, kPa mm.
+  static PetscScalar work(const Point &now, const Point &before, const NoParameters &parameters)
+  {
+    PetscScalar f0[3] = {0, 0, 0}, sum = 0;
+    wall(now, parameters, f0);
+    for (int i = 0; i < 3; ++i) sum -= f0[i] * (now.u[i] - before.u[i]);
+    return sum;
+  }
+};
+
+class LumenPressure final : public Effect {
+public:
+  const char *name() const override { return "lumen_pressure"; }
+  const char *about() const override { return "gas pressure on the airway wall"; }
+  bool active() const override { return on_; }
+  const std::vector<std::string> &surfaces() const { return surfaces_; }
+
+  PetscErrorCode declare(Options &options) override
+  {
+    PetscFunctionBeginUser;
+    options.group(name(), about());
+    PetscCall(options.given("", given_));
+    PetscCall(options.flag("",
+                           "the gas presses on the airway wall, in every scene with a ventilator (off: the paper's "
+                           "reading)",
+                           on_));
+    options.group(name(), about(), on_, "-lumen_pressure");
+    PetscCall(options.given("surfaces", surfaces_given_));
+    PetscCall(options.names("surfaces", "surfaces on which the gas presses (default: those of -airflow_surfaces)",
+                            surfaces_));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+  PetscErrorCode consider(Options &options, const Mesh &mesh, const SceneFacts &facts) override
+  {
+    PetscFunctionBeginUser;
+    if (!on_) PetscFunctionReturn(PETSC_SUCCESS);
+    if (!surfaces_given_) {
+      surfaces_ = facts.airway_surfaces;
+      options.settle("surfaces", name(), surfaces_);
+    }
+    if (given_ || surfaces_given_ || (facts.ventilator && facts.airflow)) PetscFunctionReturn(PETSC_SUCCESS);
+    // not asked for: on where there is a gas and a wall
+    const auto exists = [&](const std::string &surface) { return mesh.surfaces().count(surface) > 0; };
+    on_ = facts.ventilator && std::all_of(surfaces_.begin(), surfaces_.end(), exists);
+    if (on_) PetscFunctionReturn(PETSC_SUCCESS);
+    options.turn_off(name());
+    if (facts.ventilator)
+      PetscCall(PetscPrintf(options.comm(),
+                            "pulmo: note: the mesh has no surface %s, so the gas presses on no airway wall; name the "
+                            "wall with -lumen_pressure_surfaces, or give -lumen_pressure off\n",
+                            surfaces_.front().c_str()));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+  PetscErrorCode check(const Options &options, const Mesh &mesh, const SceneFacts &facts) override
+  {
+    PetscFunctionBeginUser;
+    PetscCall(mesh.require_surfaces(surfaces_, "-lumen_pressure_surfaces"));
+    PulmoUserCheck(facts.airflow || facts.ventilator, options.comm(),
+                   "-lumen_pressure needs a gas pressure: give -ventilator, -airflow or both");
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+  PetscErrorCode terms(Composition &c, const SceneFacts &facts) const override
+  {
+    using K = LumenPressureKernels;
+    using P = NoParameters;
+
+    PetscFunctionBeginUser;
+    for (const std::string &surface : surfaces_) {
+      c.surface_residual("p cof F N . eta", surface, displacement, f0(surface_residual<P, K::wall>));
+      c.surface_jacobian("wall pressure", surface, displacement, displacement,
+                         g1(surface_jacobian<P, K::wall_by_displacement>));
+      if (facts.airflow)
+        c.surface_jacobian("wall pressure", surface, displacement, pressure,
+                           g0(surface_jacobian<P, K::wall_by_pressure>));
+      c.energy(Energy::external, "external", surface, energy_density<P, K::work>);
+    }
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+private:
+  bool on_ = true, given_ = false, surfaces_given_ = false;
+  std::vector<std::string> surfaces_{"airway"};
+};
+
+} // namespace pulmo

@@ -1,0 +1,65 @@
+/// @file
+/// Effect `tissue`: momentum balance of the alveolar tissue, int P' : Grad eta, P' = dW/dF. Always on.
+#pragma once
+
+#include "pulmo/physics/effect.hpp"
+
+#include <algorithm>
+#include <cctype>
+
+namespace pulmo {
+
+/// Displacement field (mm) and the effective stress of the tissue law that the scene chose.
+class Tissue final : public Effect {
+public:
+  explicit Tissue(std::vector<std::unique_ptr<TissueLaw>> laws) : laws_(std::move(laws)) {}
+
+  const char *name() const override { return "tissue"; }
+  const char *about() const override { return "hyperelastic alveolar tissue (momentum balance)"; }
+  bool active() const override { return true; }
+  const TissueLaw &law() const { return *laws_[chosen_]; }
+
+  PetscErrorCode declare(Options &options) override
+  {
+    std::vector<std::string> names;
+    std::string wanted = laws_.front()->name();
+
+    PetscFunctionBeginUser;
+    for (const auto &law : laws_) {
+      names.emplace_back(law->name());
+      names.emplace_back(law->alias());
+    }
+    options.group(name(), about());
+    PetscCall(options.choice("", names, "tissue law", wanted));
+    const auto found = std::find(names.begin(), names.end(), wanted);
+    chosen_ = static_cast<std::size_t>(found - names.begin()) / 2;
+    for (std::size_t i = 0; i < laws_.size(); ++i) {
+      const std::string law = laws_[i]->name();
+      options.group(name(), "law " + law + " (" + laws_[i]->source() + ")", i == chosen_, "-tissue " + law);
+      PetscCall(laws_[i]->declare(options));
+    }
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+  void fields(Composition &c) const override { c.field("displacement", 3, c.elements().displacement, "mm"); }
+
+  PetscErrorCode terms(Composition &c, const SceneFacts &) const override
+  {
+    PetscInt count;
+    const PetscScalar *parameters = law().parameters(&count);
+
+    PetscFunctionBeginUser;
+    c.parameters(name(), parameters, count);
+    c.residual("P' : Grad eta", displacement, f1(law().stress_callback()));
+    c.jacobian("dP'/dF", displacement, displacement, g3(law().tangent_callback()));
+    c.energy(Energy::stored, "elastic_tissue", "", law().stored_callback());
+    c.energy(Energy::numerical, "numerical_dissipation", "", law().numerical_callback());
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+private:
+  std::vector<std::unique_ptr<TissueLaw>> laws_;
+  std::size_t chosen_ = 0;
+};
+
+} // namespace pulmo

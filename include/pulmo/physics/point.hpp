@@ -1,0 +1,233 @@
+/// @file
+/// Between PETSc's pointwise callbacks and the physics: kernels see a `Point` and their own parameter
+/// struct, never raw arrays.
+///
+/// A kernel is a static function `void k(const Point &, const Parameters &, PetscScalar out[])` that ADDS
+/// its share to `out`. The adaptors below turn it into the callback that PetscDS and PetscWeakForm take:
+///
+///   residual terms:  f0[c], f1[3 * c + d]                    for the weak form  f0 . q + f1 : Grad q
+///   jacobian terms:  g0[Nj * c + e], g1[(Nj * c + e) * 3 + d] (Grad of the trial field),
+///                    g2[(Nj * c + e) * 3 + d] (Grad of the test field), g3[((Nj * c + e) * 3 + d) * 3 + l]
+#pragma once
+
+#include "pulmo/base/petsc.hpp"
+#include "pulmo/physics/kinematics.hpp"
+
+#include <cstdint>
+#include <cstring>
+#include <string_view>
+#include <type_traits>
+
+namespace pulmo {
+
+/// Order of the fields that pulmo's kernels know. Displacement is always there, pressure only with airflow.
+enum FieldIndex : PetscInt { displacement = 0, pressure = 1 };
+
+/// The constants of PetscDS are a directory: [n, (tag, offset) x n, payload]. Each effect finds its own
+/// block by the tag made from its name and needs to know of no other.
+namespace constants {
+
+/// 50-bit FNV-1a hash of an effect's name: exact in a double.
+constexpr PetscScalar tag(std::string_view name)
+{
+  std::uint64_t h = 1469598103934665603ull;
+  for (char c : name) h = (h ^ static_cast<unsigned char>(c)) * 1099511628211ull;
+  return static_cast<PetscScalar>(h >> 14);
+}
+
+/// The parameter block of type @p P (a struct of PetscScalars that names its owner in `P::owner`).
+template <class P>
+P get(const PetscScalar c[])
+{
+  P p{};
+  if constexpr (!std::is_empty_v<P>) {
+    static_assert(std::is_trivially_copyable_v<P> && sizeof(P) % sizeof(PetscScalar) == 0,
+                  "parameters reach the kernels as plain scalars");
+    constexpr PetscScalar wanted = tag(P::owner);
+    const auto n = static_cast<PetscInt>(c[0]);
+    for (PetscInt i = 0; i < n; ++i) {
+      if (c[1 + 2 * i] == wanted) {
+        std::memcpy(static_cast<void *>(&p), c + static_cast<PetscInt>(c[2 + 2 * i]), sizeof(P));
+        break;
+      }
+    }
+  }
+  return p;
+}
+
+} // namespace constants
+
+/// For kernels without parameters of their own.
+struct NoParameters {};
+
+/// How the stage at hand makes rates: u_t = slope u + what the states before it add. Backward Euler: slope = 1 / dt.
+struct Stage {
+  PetscReal dt;           ///< from the last accepted state to the end of the stage, s
+  PetscReal slope;        ///< 1/s
+  bool multistep = false; ///< more than one state before counts (TimeScheme)
+
+  Stage(PetscReal step, PetscReal a, bool several) : dt(step), slope(a), multistep(several) {}
+  /// Backward Euler. Implicit: a step of that scheme is told by its size.
+  Stage(PetscReal step) : dt(step), slope(1 / step) {}
+};
+
+/// What the time step tells every kernel.
+struct Step {
+  static constexpr const char *owner = "step";
+  PetscScalar dt = 1;           ///< size of the step, s
+  PetscScalar slope = 1;        ///< d(rate)/d(state), 1/s
+  PetscScalar multistep = 0;    ///< 1: rates hold more than one state before (Stage)
+  PetscScalar gas_pressure = 0; ///< pressure held at the airway, kPa
+  PetscScalar airway_flux = 0;  ///< outward flux prescribed at the airway (0 while a pressure is held), mm/s
+  PetscScalar load = 1; ///< share of the dead loads that is there: less than 1 where the first step of a run was cut
+
+  Step() = default;
+  explicit Step(const Stage &stage, PetscScalar gas = 0, PetscScalar flux = 0)
+      : dt(stage.dt), slope(stage.slope), multistep(stage.multistep ? 1 : 0), gas_pressure(gas), airway_flux(flux)
+  {}
+};
+
+/// A quadrature point as a kernel sees it.
+struct Point {
+  const PointState &state;   ///< F, J, Grad u_t
+  const PetscScalar *u;      ///< displacement, mm
+  PetscScalar p = 0;         ///< alveolar pressure, kPa (airflow only)
+  const PetscScalar *grad_p; ///< Grad p, kPa/mm (null without airflow)
+  PetscReal t;               ///< time, s
+  PetscReal shift;           ///< d(u_t)/du in Jacobians, 1/s
+  const PetscReal *x;        ///< material coordinates, mm
+  const PetscReal *normal;   ///< outward unit normal (surface kernels only)
+  Step step;
+  const PetscScalar *u_t = nullptr;      ///< velocity, mm/s
+  PetscScalar p_t = 0;                   ///< kPa/s (airflow only)
+  const PetscScalar *grad_p_t = nullptr; ///< Grad p_t, kPa/(mm s) (null without airflow)
+
+  /// Pressure of the gas in the pores: the local field, or the uniform pressure without airflow, kPa.
+  PetscScalar gas_pressure() const { return grad_p ? p : step.gas_pressure; }
+};
+
+/// NfAux that says: the auxiliary array is a PointState made by pulmo's integrator, its gradients those of the rates.
+constexpr PetscInt precomputed_state = -1;
+
+template <class P>
+using Kernel = void (*)(const Point &, const P &, PetscScalar[]);
+
+namespace detail {
+
+/// The arguments that all four kinds of callback begin with.
+#define PULMO_POINT_ARGUMENTS                                                                                          \
+  PetscInt, PetscInt Nf, PetscInt NfAux, const PetscInt uOff[], const PetscInt uOff_x[], const PetscScalar u[],        \
+      const PetscScalar u_t[], const PetscScalar u_x[], const PetscInt[], const PetscInt aOff_x[],                     \
+      const PetscScalar a[], const PetscScalar[], const PetscScalar a_x[], PetscReal t
+
+/// The point of a callback. Its kinematic state is handed in by pulmo's integrator, or made here in @p storage
+/// (stock PetscFE, where auxiliary fields of the same discretisation carry u_t and p_t).
+static inline Point make_point(PointState &storage, PetscInt Nf, PetscInt NfAux, const PetscInt uOff[],
+                               const PetscInt uOff_x[], const PetscScalar u[], const PetscScalar u_t[],
+                               const PetscScalar u_x[], const PetscInt aOff_x[], const PetscScalar a[],
+                               const PetscScalar a_x[], PetscReal t, PetscReal shift, const PetscReal x[],
+                               const PetscReal normal[], const PetscScalar c[])
+{
+  const bool made = NfAux == precomputed_state, gas = Nf > pressure;
+  if (!made) make_point_state(u_x + uOff_x[displacement], NfAux > 0 ? a_x + aOff_x[displacement] : nullptr, storage);
+  return {made ? *reinterpret_cast<const PointState *>(a) : storage,
+          u + uOff[displacement],
+          gas ? u[uOff[pressure]] : 0,
+          gas ? u_x + uOff_x[pressure] : nullptr,
+          t,
+          shift,
+          x,
+          normal,
+          constants::get<Step>(c),
+          u_t ? u_t + uOff[displacement] : nullptr,
+          gas && u_t ? u_t[uOff[pressure]] : 0,
+          gas && a_x && (made || NfAux > pressure) ? a_x + aOff_x[pressure] : nullptr};
+}
+
+template <class P, Kernel<P> K>
+void volume_residual(PULMO_POINT_ARGUMENTS, const PetscReal x[], PetscInt, const PetscScalar c[], PetscScalar f[])
+{
+  PointState storage;
+  K(make_point(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_x, t, 0, x, nullptr, c),
+    constants::get<P>(c), f);
+}
+
+template <class P, Kernel<P> K>
+void volume_jacobian(PULMO_POINT_ARGUMENTS, PetscReal shift, const PetscReal x[], PetscInt, const PetscScalar c[],
+                     PetscScalar g[])
+{
+  PointState storage;
+  K(make_point(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_x, t, shift, x, nullptr, c),
+    constants::get<P>(c), g);
+}
+
+template <class P, Kernel<P> K>
+void surface_residual(PULMO_POINT_ARGUMENTS, const PetscReal x[], const PetscReal n[], PetscInt, const PetscScalar c[],
+                      PetscScalar f[])
+{
+  PointState storage;
+  K(make_point(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_x, t, 0, x, n, c), constants::get<P>(c), f);
+}
+
+template <class P, Kernel<P> K>
+void surface_jacobian(PULMO_POINT_ARGUMENTS, PetscReal shift, const PetscReal x[], const PetscReal n[], PetscInt,
+                      const PetscScalar c[], PetscScalar g[])
+{
+  PointState storage;
+  K(make_point(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_x, t, shift, x, n, c), constants::get<P>(c),
+    g);
+}
+
+} // namespace detail
+
+#undef PULMO_POINT_ARGUMENTS
+
+/// A callback and the owner of the parameters that it reads (null: it reads none).
+template <class F>
+struct Callback {
+  F function = nullptr;
+  const char *owner = nullptr;
+};
+
+template <class P>
+constexpr const char *owner_of()
+{
+  if constexpr (std::is_empty_v<P>)
+    return nullptr;
+  else
+    return P::owner;
+}
+
+// The callback of a kernel: residual terms (f0, f1) and Jacobian terms (g0 ... g3) of the volume and of surfaces.
+template <class P, Kernel<P> K>
+constexpr Callback<PetscPointFunc> volume_residual{detail::volume_residual<P, K>, owner_of<P>()};
+template <class P, Kernel<P> K>
+constexpr Callback<PetscPointJac> volume_jacobian{detail::volume_jacobian<P, K>, owner_of<P>()};
+template <class P, Kernel<P> K>
+constexpr Callback<PetscBdPointFunc> surface_residual{detail::surface_residual<P, K>, owner_of<P>()};
+template <class P, Kernel<P> K>
+constexpr Callback<PetscBdPointJac> surface_jacobian{detail::surface_jacobian<P, K>, owner_of<P>()};
+
+/// A share of the energy balance of a step, from the state at its end and the one at its start: kPa per reference
+/// volume, kPa mm per reference area. Rates are those of @p now.
+template <class P>
+using EnergyKernel = PetscScalar (*)(const Point &now, const Point &before, const P &);
+
+/// The same as the energy audit calls it.
+using EnergyDensity = PetscScalar (*)(const Point &now, const Point &before, const PetscScalar constants[]);
+
+namespace detail {
+
+template <class P, EnergyKernel<P> K>
+PetscScalar energy_density(const Point &now, const Point &before, const PetscScalar c[])
+{
+  return K(now, before, constants::get<P>(c));
+}
+
+} // namespace detail
+
+/// Callback of an energy kernel.
+template <class P, EnergyKernel<P> K>
+constexpr Callback<EnergyDensity> energy_density{detail::energy_density<P, K>, owner_of<P>()};
+
+} // namespace pulmo

@@ -1,0 +1,45 @@
+/// @file
+/// Numerical error bars of the clinical numbers: `-error_estimate`.
+#pragma once
+
+#include "pulmo/input/options.hpp"
+#include "pulmo/observers/error_bars.hpp"
+
+namespace pulmo {
+
+class Output;
+class Registry;
+class Scene;
+class Simulation;
+
+/// Runs the scene again with steps of 2 dt and 4 dt, with 4 dt and tighter tolerances, and with 4 dt on another mesh;
+/// docs/accuracy/error_bars.md.
+class ErrorEstimate {
+public:
+  explicit ErrorEstimate(const Registry &registry) : registry_(registry) {}
+
+  /// Declares -error_estimate and -error_estimate_mesh.
+  PetscErrorCode declare(Options &options);
+  bool in_use() const { return in_use_; }
+  /// Before the run: refuses a scene that has no clinical numbers, and a mesh that cannot be read.
+  PetscErrorCode check(const Options &options, const Scene &scene) const;
+  /// Refuses a run whose steps or solver @p changed at a restart (Checkpoint::numerics_changed): all bars are made of
+  /// the options of its last session.
+  PetscErrorCode check_sessions(const Options &options, const std::string &changed) const;
+  /// After the run: @p numbers are its own. A level that cannot be finished leaves parts empty.
+  PetscErrorCode make(const Options &options, const Output &output, const Scene &scene, const Simulation &simulation,
+                      const std::vector<ClinicalEntry> &numbers, ErrorReport &report) const;
+
+private:
+  PetscErrorCode try_other_mesh(const Options &options, const Scene &scene) const;
+  PetscErrorCode level_options(const Options &options, const OptionList &changes, OptionList &list) const;
+  PetscErrorCode other_mesh(OptionList &changes, std::string &name) const;
+  PetscErrorCode run_level(const Options &options, const Output &output, const OptionList &changes,
+                           ErrorLevel &level) const;
+
+  const Registry &registry_;
+  bool in_use_ = false;
+  std::string mesh_;
+};
+
+} // namespace pulmo

@@ -1,0 +1,78 @@
+/// @file
+/// Why a run could not go on: at the airway's rim, everywhere, in some other place, or in the solver; and the paragraph
+/// that says so.
+#pragma once
+
+#include "pulmo/fem/model.hpp"
+#include "pulmo/physics/scene.hpp"
+#include "pulmo/time/signal_row.hpp"
+
+#include <optional>
+#include <string>
+#include <vector>
+
+namespace pulmo {
+
+/// An attempt at a step that was not accepted.
+struct FailedAttempt {
+  PetscReal time, dt; ///< where the step began and how long it was, s
+  std::string reason;
+  PetscInt newton;
+  Measures measures; ///< of the last state with J <= 0, if any
+  bool inverted;
+};
+
+/// Stiffness of the tissue against the softest of all plane waves at a state: the least eigenvalue over all directions
+/// n (of the reference state) of the acoustic tensor A_iJkL n_J n_L, kPa. At zero or below the law is not elliptic
+/// there: shape or volume change by themselves. A gas pressure adds nothing to it.
+struct AcousticStiffness {
+  PetscReal least = PETSC_MAX_REAL; ///< kPa
+  PetscReal direction[3] = {0, 0, 0};
+};
+/// @p refine: search on around the softest of the directions tried.
+AcousticStiffness acoustic_stiffness(const TissueLaw &law, const PointState &state, bool refine = true,
+                                     const PetscScalar *constants = nullptr);
+
+/// dp/dJ of tissue that inflates freely, F = J^(1/3) I and p = dW/dJ, kPa: at zero or below nothing but what holds the
+/// lung from outside keeps it from going on by itself.
+PetscReal inflation_stiffness(const TissueLaw &law, PetscReal J);
+
+/// What is known of the end of a run.
+struct FailureFacts {
+  std::vector<FailedAttempt> attempts; ///< the last ones
+  std::vector<SignalRow> rows;         ///< accepted, of the whole run
+  bool crawled = false;                ///< it ended because steps only crawled
+  bool free_flow = false;              ///< in a phase that shares a prescribed flow by area
+  bool prescribes_pressure = false;    ///< in a phase that prescribes pressure
+  std::string phase = "run";
+};
+
+/// Where and why.
+struct Diagnosis {
+  enum class Kind {
+    rim,        ///< the worst cell is within two cells of the edge of the airway
+    everywhere, ///< the law has no stiffness left at this stretch
+    inside,     ///< one place, neither of the two
+    solver      ///< the tissue is well
+  };
+  Kind kind = Kind::solver;
+  std::optional<Measures> worst;     ///< the cell that turned inside out, or is close to it
+  std::optional<PetscReal> from_rim; ///< its distance from the edge of the airway, mm
+  PetscReal mean_J = 1;              ///< of the last good state
+  PetscReal inflation = 0;           ///< inflation_stiffness() there, kPa
+  PetscReal acoustic = 0;         ///< acoustic_stiffness() of the mean deformation gradient of the last good state, kPa
+  PetscReal acoustic_at_rest = 0; ///< the same at rest, kPa
+  bool inflation_lost = false, acoustic_lost = false; ///< next to nothing of them is left
+  PetscReal lost_share = 0; ///< share of the volume whose cells are not elliptic in the last good state
+  std::string limit;        ///< sentence on a limit point of the pressure; empty if there is none
+  const char *name() const; ///< of the kind, as in failure.json
+};
+
+/// Looks at the last good state @p local (a local vector). Collective.
+PetscErrorCode diagnose(const Scene &scene, const Model &model, const FailureFacts &facts, Vec local,
+                        Diagnosis &diagnosis);
+
+/// One paragraph: where, when, what was tried, why, what to try.
+std::string failure_text(const Scene &scene, const FailureFacts &facts, const Diagnosis &diagnosis);
+
+} // namespace pulmo

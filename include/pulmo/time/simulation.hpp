@@ -1,0 +1,180 @@
+/// @file
+/// The run of a scene over time: one TSSolve per ventilator phase, step control, acceptance of steps.
+#pragma once
+
+#include "pulmo/base/stop_signal.hpp"
+#include "pulmo/fem/model.hpp"
+#include "pulmo/fem/pins.hpp"
+#include "pulmo/physics/scene.hpp"
+#include "pulmo/solvers/lagging.hpp"
+#include "pulmo/solvers/preconditioning.hpp"
+#include "pulmo/time/airway.hpp"
+#include "pulmo/time/balance.hpp"
+#include "pulmo/time/failure.hpp"
+#include "pulmo/time/observer.hpp"
+#include "pulmo/time/predictor.hpp"
+#include "pulmo/time/step_control.hpp"
+
+#include <set>
+
+namespace pulmo {
+
+/// Wall seconds by stage, largest over the ranks at the end.
+struct StageSeconds {
+  double setup = 0, residual = 0, jacobian = 0, solve = 0, output = 0, total = 0;
+};
+
+class Simulation {
+public:
+  Simulation(const Options &options, const Scene &scene, Model &model)
+      : options_(options), scene_(scene), model_(model), airway_(model, scene.facts(), scheme_)
+  {}
+
+  /// Declares the options of the steps.
+  PetscErrorCode declare(Options &options);
+  /// Creates TS, SNES, KSP and the matrix from the options database.
+  PetscErrorCode setup();
+  /// Counts what was done before the run as set-up, s.
+  void setup_took(double seconds) { seconds_.setup = seconds; }
+  void add(Observer &observer) { observers_.push_back(&observer); }
+  /// Lets a signal end the run after the step at hand. @p signal must outlive the run.
+  void heed(StopSignal &signal) { stop_signal_ = &signal; }
+  /// Writes or reads the run after its last accepted step, observers included; after reading, run() goes on from there.
+  PetscErrorCode persist(Archive &archive);
+  /// Runs to the end. @p finished is false if a signal stopped the run, or if no step could be accepted any more;
+  /// failure_text() then tells why.
+  PetscErrorCode run(bool &finished);
+
+  Vec state() const { return state_; }        ///< global vector, the last accepted state
+  Vec local_state() const { return before_; } ///< the same, local, constrained values in place
+  PetscReal time() const { return accepted_.time; }
+  bool at_end() const { return same(accepted_.time, end_); }
+  bool stopped() const { return stopped_; } ///< by a signal
+  const std::vector<SignalRow> &rows() const { return rows_; }
+  PetscReal mass_balance_error() const { return worst_balance_; } ///< largest of the run, mm^3
+  PetscReal min_J() const { return min_J_; }
+  PetscReal support_reaction() const { return worst_reaction_; } ///< largest force component of the run, kPa mm^2
+  const PinForces &pins() const { return pins_; }
+  PetscInt rejected_steps() const { return rejected_; }
+  const StageSeconds &seconds() const { return seconds_; }
+  const TimeScheme &scheme() const { return scheme_; }
+  const StepControl &step_control() const { return step_control_; }
+  PetscReal wanted_dt() const { return wanted_dt_; } ///< -ts_dt, s
+  TS ts() const { return ts_; }
+  /// Makes failure_text() say that @p what, as the solver leaves @p left, and which options made it so.
+  PetscErrorCode end_unsolved(const std::string &what, const std::string &left);
+  /// One paragraph on a run that could not go on: where, when, what was tried, what to try.
+  std::string failure_text() const;
+  /// Where and why such a run ended.
+  const Diagnosis &diagnosis() const { return diagnosis_; }
+
+  // what PETSc calls back
+  PetscErrorCode residual(PetscReal t, Vec X, Vec Xdot, Vec F);
+  PetscErrorCode jacobian(PetscReal t, Vec X, Vec Xdot, Mat A);
+  PetscErrorCode before_stage(PetscReal t);
+  /// First guess of a step; comes as the state before it.
+  PetscErrorCode guess(SNES snes, Vec X);
+  /// Completes the Newton step @p Y of a solution @p X whose airway pressure is an unknown: one more right-hand side.
+  PetscErrorCode border(SNES snes, Vec X, Vec Y);
+  /// The matrix times @p x. Along a bordered step the rate of change of the residual is minus the residual, as along
+  /// any Newton step; the matrix lacks the column and the row of the airway pressure.
+  PetscErrorCode product(Vec x, Vec y);
+  /// PETSc's test, but a prescribed volume must be met too.
+  PetscErrorCode converged(SNES snes, PetscInt it, PetscReal xnorm, PetscReal ynorm, PetscReal fnorm,
+                           SNESConvergedReason *reason);
+  PetscErrorCode after_stage();
+  PetscErrorCode accept_stage(PetscReal t, Vec X, PetscBool *accept);
+  PetscErrorCode after_step();
+  /// Whether the step of size @p h from @p t is accepted, and the size of the one after it (or of the next attempt):
+  /// grows back after cuts, or follows the error in time.
+  PetscReal next_step(PetscReal t, PetscReal h, TSAdapt adapt, PetscBool &accept);
+
+private:
+  PetscErrorCode create_solver();
+  FailureFacts failure_facts() const;
+  /// The row at t = 0.
+  PetscErrorCode start();
+  PetscErrorCode persist_rows(Archive &archive);
+  /// Finds the phase that goes on at what was read.
+  PetscErrorCode resume(const Archive &archive, PetscInt index, PetscReal wanted_dt, PetscReal phase_end);
+  /// Ends the run with @p reason if a signal asks to stop.
+  PetscErrorCode heed_signal(TSConvergedReason reason);
+  PetscErrorCode offer_fixed_stress(KSP ksp);
+  /// Whether two times of this run are the same up to rounding.
+  bool same(PetscReal t, PetscReal other) const;
+  /// The last accepted state is at a kink in time: nothing may look back beyond it.
+  void begin_smooth_stretch();
+  /// Step size from time @p t, shortened to land on the end of the ramp or of the phase.
+  PetscReal landing(PetscReal t) const;
+  PetscErrorCode make_rate();
+  PetscErrorCode local_residual(PetscReal t);
+  PetscErrorCode scatter(PetscReal t, Vec X, Vec Xdot);
+  PetscErrorCode judge(PetscReal t, PetscReal volume, PetscReal pressure, bool &solved);
+  PetscErrorCode consistent_flow(PetscReal &flow) const;
+  PetscErrorCode keep_step(PetscReal dt);
+  PetscErrorCode fail(PetscReal dt, const std::string &reason, PetscInt newton, const Measures &measures, bool inverted,
+                      bool retry);
+  PetscErrorCode warn_of_faint_load(SNES snes);
+  /// Says so, once for each line of a programme, if a phase that begins at @p pressure (cmH2O) has a lower limit.
+  PetscErrorCode warn_of_low_limit(const Phase &phase, PetscReal pressure);
+  /// The same before the run for all phases whose first pressure is known by then.
+  PetscErrorCode warn_of_low_limits();
+  /// Step size asked for in the phase at hand (before the run: in its first), s.
+  PetscReal asked_dt() const { return (phase_ ? *phase_ : phases_.front()).dt.value_or(wanted_dt_); }
+  /// Notes an attempt that failed; ends the run if the next one would be too short.
+  PetscErrorCode reject(PetscReal dt, const std::string &reason, PetscInt newton, const Measures &measures,
+                        bool inverted);
+  PetscErrorCode report(const SignalRow &row, const Measures &measures);
+  std::vector<Phase> phases() const;
+
+  const Options &options_;
+  const Scene &scene_;
+  Model &model_;
+  TimeScheme scheme_;
+  Airway airway_;
+  StepControl step_control_;
+  StepControl::Value candidate_; ///< at the end of the step that is to be accepted
+  Balance balance_;
+  std::string unsolved_; ///< why the run ends, if it is not solved
+  Predictor predictor_;
+  PinForces pins_;
+  Lagging lagging_;
+  FixedStress fixed_stress_;
+  std::vector<Observer *> observers_;
+  StopSignal *stop_signal_ = nullptr;
+  TSHandle ts_;
+  MatHandle matrix_;
+  VecHandle state_, local_, rate_, local_residual_, before_;
+  VecHandle border_x_, border_b_, border_z_, border_r_, border_y_; ///< global; the last one local
+  std::vector<Phase> phases_;
+  std::set<std::string> low_limits_; ///< lines of the programme that were warned of
+  const Phase *phase_ = nullptr;
+  PetscReal wanted_dt_ = 0.05, dt_ = 0.05; ///< -ts_dt; in use before any shortening to land on a time
+  PetscReal next_dt_ = 0;                  ///< size of the step after the last accepted one, before any cut
+  PetscReal end_ = 0;
+  SignalRow accepted_;
+  std::vector<SignalRow> rows_;
+  PetscReal delivered_ = 0, worst_balance_ = 0, worst_reaction_ = 0, min_J_ = 1;
+  PetscInt newton_ = 0, krylov_ = 0, rejected_ = 0;
+  void (*multiply_)() = nullptr; ///< PETSc's product with matrix_
+  struct {
+    Vec step = nullptr, product = nullptr;
+  } bordered_;                  ///< a bordered step and the residual at its start, until the search along it begins
+  PetscReal start_norm_ = 0;    ///< residual of the attempt at hand before any Newton step and guess
+  int extra_newton_ = 0;        ///< Newton steps of the attempt at hand for the prescribed volume alone
+  bool inverted_ = false;       ///< the attempt at hand met J <= 0
+  bool tests_jacobian_ = false; ///< -snes_test_jacobian
+  bool cut_ = false;            ///< the step at hand was cut
+  bool resumed_ = false;        ///< the run goes on from what was read
+  bool stopped_ = false;        ///< by a signal
+  int crawled_ = 0;             ///< accepted steps in a row that were tiny
+  Measures inverted_measures_;
+  std::vector<FailedAttempt> failures_;
+  Diagnosis diagnosis_; ///< of a run that could not go on
+  StageSeconds seconds_;
+};
+
+/// Registers the TSAdapt type "pulmo": cut on failure, grow back to the step asked for, land on kinks.
+PetscErrorCode register_step_control();
+
+} // namespace pulmo

@@ -1,0 +1,75 @@
+/// @file
+/// The rate of what is conserved (gas, volume) in the stage at hand, as PETSc's TS makes the rate of the state.
+#pragma once
+
+#include "pulmo/fem/archive.hpp"
+#include "pulmo/fem/model.hpp"
+
+#include <array>
+
+namespace pulmo {
+
+/// Keeps the past that a rate is made of: dy/dt = slope y + sum w_i y_i (LeVeque 2007, Finite Difference Methods for
+/// Ordinary and Partial Differential Equations, section 8.6; weights for any step sizes from Lagrange's polynomials).
+///
+/// -ts_type beuler: y_0 is the state before the step. The kernels make dJ/dt themselves (effects/airflow.hpp).
+///
+/// -ts_type bdf, order 2: the last two states. After a kink PETSc makes half a step with backward Euler first, and y_1
+/// is the state there. Kernels see the rate of the fields itself. That of J is no function of it: they give
+/// slope (J - 1), and the past is kept as int (J_i - 1) q, so that gas is conserved to rounding.
+class TimeScheme {
+public:
+  /// Reads the type off @p ts and refuses those whose rate is not conservative here. @p like: a local vector.
+  PetscErrorCode setup(TS ts, Vec like);
+  bool multistep() const { return multistep_; }
+  /// Whether the stage at hand is the half step that PETSc's BDF begins with.
+  bool half_step() const { return half_; }
+  int order() const { return multistep_ ? 2 : 1; }
+
+  /// Begins with the state @p local of volume @p volume (mm^3 above rest) at time @p t.
+  PetscErrorCode begin(Model &model, PetscReal t, PetscReal volume, Vec local);
+  /// Writes or reads the past; the arguments as for begin(), of the last accepted step.
+  PetscErrorCode persist(Archive &archive, Model &model, PetscReal t, PetscReal volume, Vec local);
+  /// Before the first step of a TSSolve: lets it look back on what was read, or on nothing.
+  PetscErrorCode begin_solve(PetscInt steps);
+  /// Begins a stage that ends at time @p t of a step of size @p dt, s.
+  PetscErrorCode begin_stage(PetscReal t, PetscReal dt);
+  /// Takes note of the solution of the stage at hand if it is the half step of a restart.
+  PetscErrorCode accept_stage(Model &model, PetscReal t, PetscReal volume, Vec local);
+  /// Takes note of an accepted step.
+  PetscErrorCode accept(Model &model, PetscReal t, PetscReal volume, Vec local);
+
+  PetscReal slope() const { return slope_; } ///< 1/s
+  /// What kernels are told of the stage at hand.
+  Stage stage() const { return {dt_, slope_, multistep_}; }
+  /// Rate of the fields at the local state @p now, constrained values in place.
+  PetscErrorCode rate(Vec now, Vec rate) const;
+  /// The share of the past in the rate of volume, mm^3/s.
+  PetscReal past_flow() const;
+  /// Rate of volume at @p volume, mm^3/s.
+  PetscReal flow(PetscReal volume) const { return slope_ * volume + past_flow(); }
+  /// Adds the share of the past to the mass rows of a local residual of @p model.
+  PetscErrorCode add_past(const Model &model, Vec residual) const;
+
+private:
+  struct Past {
+    PetscReal time = 0, volume = 0; ///< s, mm^3
+    VecHandle state;                ///< local; with more than one state before
+    VecHandle gas;                  ///< local: its int (J - 1) q in the mass rows, mm^3
+  };
+
+  /// Fills @p past with the state @p local.
+  PetscErrorCode keep(Model &model, PetscReal t, PetscReal volume, Vec local, Past &past);
+
+  TS ts_ = nullptr;
+  bool multistep_ = false, gas_ = false; ///< BDF; and there is a mass balance
+  bool half_ = false;                    ///< the stage at hand is the half step of a restart
+  bool resumes_ = false;                 ///< the first step looks back on a past that was read
+  Past last_, earlier_, middle_;
+  std::array<const Past *, 2> used_{};
+  std::array<PetscReal, 2> weight_{};
+  PetscReal dt_ = 1, slope_ = 1;
+  VecHandle zero_, rest_; ///< local: zero; for keep()
+};
+
+} // namespace pulmo

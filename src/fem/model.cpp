@@ -1,0 +1,834 @@
+#include "pulmo/fem/model.hpp"
+
+#include "pulmo/fem/pattern.hpp"
+#include "pulmo/mesh/mesh.hpp"
+#include "pulmo/physics/parameter_fields.hpp"
+
+#include <algorithm>
+#include <cstring>
+#include <set>
+
+namespace pulmo {
+
+namespace {
+
+/// Nodes that hold one value by different sums differ by less than this share of it.
+constexpr PetscReal rounding = 1e-14;
+
+} // namespace
+
+PetscErrorCode Model::declare(Options &options, const Elements &elements)
+{
+  const PetscInt k = elements.displacement;
+
+  PetscFunctionBeginUser;
+  quadrature_degree_ = 2 * k - 1;
+  options.group("quadrature", "integration (-petscfe_type pulmo|basic chooses the integrator)");
+  PetscCall(
+      options.whole("degree", "-", Range::between(std::max<PetscReal>(1, 2 * k - 2), 8),
+                    "degree of the rule in the cells (2 k - 1 for displacement of degree k: for P2 8 points, exact "
+                    "for det F; 4: 14 points, for checks)",
+                    quadrature_degree_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::build(Composition composition, PetscReal modulus)
+{
+  PetscFunctionBeginUser;
+  mesh_ = &composition.mesh();
+  composition_ = std::make_unique<Composition>(std::move(composition));
+  modulus_ = modulus;
+  PetscCall(this->composition().check_parameters(PetscObjectComm((PetscObject)mesh_->dm())));
+  PetscCall(DMClone(mesh_->dm(), dm_.out()));
+  PetscCall(create_fields());
+  PetscCall(create_weak_form());
+  PetscCall(create_section());
+  PetscDS rate_ds = nullptr;
+  if (!own_) {
+    PetscCall(create_stock());
+    PetscCall(DMGetDS(rate_dm_, &rate_ds));
+  }
+  PetscCall(assembly_.setup(dm_, rate_ds, this->composition().varying()));
+  row_scale_.assign(this->composition().fields().size(), 1);
+  PetscCall(set_step(1, 0));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// For PETSc's own loops over cells: a DM with the volume terms only (PETSc 3.18 has wrong gradients on facets, see
+/// Assembly) and an auxiliary field of the same discretisation that carries the rates.
+PetscErrorCode Model::create_stock()
+{
+  PetscSection section;
+  PetscDS ds;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMGetLocalSection(dm_, &section));
+  for (DMHandle *dm : {&stock_dm_, &rate_dm_}) {
+    PetscCall(DMClone(mesh_->dm(), dm->out()));
+    PetscCall(compat::copy_fields(dm_, *dm));
+    PetscCall(DMCreateDS(*dm));
+    PetscCall(DMSetLocalSection(*dm, section));
+  }
+  PetscCall(DMGetDS(stock_dm_, &ds));
+  PetscCall(add_volume_terms(ds));
+  PetscCall(DMCreateLocalVector(rate_dm_, rate_.out()));
+  PetscCall(DMSetAuxiliaryVec(stock_dm_, nullptr, 0, 0, rate_));
+  PetscCall(DMCreateGlobalVector(dm_, scale_.out()));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::add_volume_terms(PetscDS ds) const
+{
+  PetscWeakForm wf;
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscDSGetWeakForm(ds, &wf));
+  for (const Term &t : composition().terms()) {
+    if (!t.surface.empty()) continue;
+    if (t.trial < 0)
+      PetscCall(PetscWeakFormAddResidual(wf, nullptr, 0, t.test, 0, t.f0, t.f1));
+    else
+      PetscCall(PetscWeakFormAddJacobian(wf, nullptr, 0, t.test, t.trial, 0, t.g0, t.g1, t.g2, t.g3));
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::create_fields()
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
+  QuadratureHandle rule, face_rule;
+  PetscFE first = nullptr;
+  PetscBool own;
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscDTSimplexQuadrature(3, quadrature_degree_, PETSCDTSIMPLEXQUAD_MINSYM, rule.out()));
+  PetscCall(PetscDTSimplexQuadrature(2, std::max<PetscInt>(4, quadrature_degree_), PETSCDTSIMPLEXQUAD_MINSYM,
+                                     face_rule.out()));
+  PetscInt index = 0;
+  for (const FieldSpec &field : composition().fields()) {
+    FEHandle fe;
+    PetscCall(PetscFECreateLagrange(comm, 3, field.components, PETSC_TRUE, field.degree, PETSC_DETERMINE, fe.out()));
+    PetscCall(PetscObjectSetName((PetscObject)(PetscFE)fe, field.name.c_str()));
+    if (!first) {
+      PetscCall(PetscFESetQuadrature(fe, rule));
+      PetscCall(PetscFESetFaceQuadrature(fe, face_rule));
+      first = fe;
+    } else {
+      PetscCall(PetscFECopyQuadrature(first, fe));
+    }
+    PetscCall(PetscFESetType(fe, "pulmo"));
+    PetscCall(PetscFESetFromOptions(fe));
+    PetscCall(PetscObjectTypeCompare((PetscObject)(PetscFE)fe, "pulmo", &own));
+    own_ = own;
+    PulmoUserCheck(own_ || quadrature_degree_ > 1, comm,
+                   "-petscfe_type basic: PETSc has no room for the points of facets where cells have one; give "
+                   "-quadrature_degree 2 or leave basic out");
+    PetscCall(DMSetField(dm_, index++, nullptr, (PetscObject)(PetscFE)fe));
+    if (index == 1) PetscCall(DMGetField(dm_, 0, nullptr, (PetscObject *)&first));
+  }
+  PetscCall(DMCreateDS(dm_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::create_weak_form()
+{
+  PetscDS ds;
+  std::map<std::pair<std::string, PetscInt>, PetscWeakForm> boundary; // of each surface and test field
+
+  PetscFunctionBeginUser;
+  PetscCall(DMGetDS(dm_, &ds));
+  PetscCall(add_volume_terms(ds));
+  for (const Term &term : composition().terms()) {
+    if (term.surface.empty()) continue;
+    DMLabel label;
+    const PetscInt value = mesh_->surface(term.surface).value;
+    PetscCall(DMGetLabel(dm_, term.surface.c_str(), &label));
+    PetscWeakForm &wf = boundary[{term.surface, term.test}];
+    if (!wf) {
+      PetscInt bd;
+      PetscCall(DMAddBoundary(dm_, DM_BC_NATURAL, term.surface.c_str(), label, 1, &value, term.test, 0, nullptr,
+                              nullptr, nullptr, nullptr, &bd));
+      PetscCall(PetscDSGetBoundary(ds, bd, &wf, nullptr, nullptr, nullptr, nullptr, nullptr, nullptr, nullptr, nullptr,
+                                   nullptr, nullptr, nullptr));
+    }
+    if (term.trial < 0)
+      PetscCall(PetscWeakFormAddBdResidual(wf, label, value, term.test, 0, term.bd_f0, term.bd_f1));
+    else
+      PetscCall(PetscWeakFormAddBdJacobian(wf, label, value, term.test, term.trial, 0, term.bd_g0, term.bd_g1,
+                                           term.bd_g2, term.bd_g3));
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// constraint_of[5 * point + component]: which constraint holds that component there, or -1; pressure is component 3,
+/// pressure steered by the ventilator component 4.
+PetscErrorCode Model::find_constraints(std::vector<PetscInt> &constraint_of)
+{
+  PetscInt begin, end;
+  PetscSF sf;
+  std::vector<PetscInt> facets;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMPlexGetChart(dm_, &begin, &end));
+  constraint_of.assign(static_cast<std::size_t>(5 * end), -1);
+  const auto &constraints = composition().constraints();
+  for (std::size_t k = 0; k < constraints.size(); ++k) {
+    const Constraint &constraint = constraints[k];
+    const auto hold = [&](PetscInt point) {
+      for (PetscInt c = 0; c < 3; ++c)
+        if (constraint.component[c])
+          constraint_of[5 * point + (constraint.field == displacement ? c
+                                     : constraint.at_airway           ? 4
+                                                                      : 3)] = static_cast<PetscInt>(k);
+    };
+    for (PetscInt vertex : constraint.vertices) hold(vertex);
+    if (constraint.surface.empty()) continue;
+    PetscCall(mesh_->facets(constraint.surface, facets));
+    for (PetscInt facet : facets) {
+      PetscInt *closure = nullptr, n_closure;
+      PetscCall(DMPlexGetTransitiveClosure(dm_, facet, PETSC_TRUE, &n_closure, &closure));
+      for (PetscInt j = 0; j < n_closure; ++j) hold(closure[2 * j]);
+      PetscCall(DMPlexRestoreTransitiveClosure(dm_, facet, PETSC_TRUE, &n_closure, &closure));
+    }
+  }
+  // an edge or vertex of a surface may be on a rank that has none of the surface's facets
+  PetscCall(DMGetPointSF(dm_, &sf));
+  PetscInt roots;
+  PetscCall(PetscSFGetGraph(sf, &roots, nullptr, nullptr, nullptr));
+  if (roots >= 0) {
+    std::vector<PetscInt> one(static_cast<std::size_t>(end));
+    for (PetscInt c = 0; c < 5; ++c) {
+      for (PetscInt p = begin; p < end; ++p) one[p] = constraint_of[5 * p + c];
+      std::vector<PetscInt> all = one;
+      PetscCall(PetscSFReduceBegin(sf, MPIU_INT, one.data(), all.data(), MPI_MAX));
+      PetscCall(PetscSFReduceEnd(sf, MPIU_INT, one.data(), all.data(), MPI_MAX));
+      one = all;
+      PetscCall(PetscSFBcastBegin(sf, MPIU_INT, all.data(), one.data(), MPI_REPLACE));
+      PetscCall(PetscSFBcastEnd(sf, MPIU_INT, all.data(), one.data(), MPI_REPLACE));
+      for (PetscInt p = begin; p < end; ++p) constraint_of[5 * p + c] = one[p];
+    }
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::create_section()
+{
+  const auto &fields = composition().fields();
+  const auto n_fields = static_cast<PetscInt>(fields.size());
+  std::vector<PetscInt> constraint_of, components, dofs, bc_field;
+  std::vector<DMLabel> labels(fields.size(), nullptr);
+  std::vector<ISHandle> owned;
+  std::vector<IS> bc_components, bc_points;
+  PetscInt begin, end;
+  SectionHandle section;
+
+  PetscFunctionBeginUser;
+  PetscCall(find_constraints(constraint_of));
+  PetscCall(DMPlexGetChart(dm_, &begin, &end));
+  for (PetscInt f = 0; f < n_fields; ++f) {
+    PetscFE fe;
+    const PetscInt *per_depth;
+    PetscCall(DMGetField(dm_, f, nullptr, (PetscObject *)&fe));
+    PetscCall(PetscFEGetNumDof(fe, &per_depth));
+    components.push_back(fields[f].components);
+    dofs.insert(dofs.end(), per_depth, per_depth + 4);
+  }
+  // group the constrained points by field and set of components: no point is in two groups of a field
+  std::map<std::pair<PetscInt, int>, std::vector<PetscInt>> groups;
+  for (PetscInt p = begin; p < end; ++p) {
+    int set = 0;
+    for (int c = 0; c < 3; ++c)
+      if (constraint_of[5 * p + c] >= 0) set |= 1 << c;
+    if (set) groups[{displacement, set}].push_back(p);
+    if (constraint_of[5 * p + 3] >= 0 && n_fields > pressure) groups[{pressure, 1}].push_back(p);
+  }
+  // every rank passes the same groups in the same order
+  for (PetscInt f = 0; f < std::min<PetscInt>(n_fields, 2); ++f)
+    for (int set = 1; set < (f == displacement ? 8 : 2); ++set) {
+      const auto &points = groups[{f, set}];
+      std::vector<PetscInt> which;
+      for (int c = 0; c < 3; ++c)
+        if (set & (1 << c)) which.push_back(c);
+      owned.emplace_back();
+      PetscCall(ISCreateGeneral(PETSC_COMM_SELF, (PetscInt)which.size(), which.data(), PETSC_COPY_VALUES,
+                                owned.back().out()));
+      bc_components.push_back(owned.back());
+      owned.emplace_back();
+      PetscCall(ISCreateGeneral(PETSC_COMM_SELF, (PetscInt)points.size(), points.data(), PETSC_COPY_VALUES,
+                                owned.back().out()));
+      bc_points.push_back(owned.back());
+      bc_field.push_back(f);
+    }
+  PetscCall(DMPlexCreateSection(dm_, labels.data(), components.data(), dofs.data(), (PetscInt)bc_field.size(),
+                                bc_field.data(), bc_components.data(), bc_points.data(), nullptr, section.out()));
+  for (PetscInt f = 0; f < n_fields; ++f) PetscCall(PetscSectionSetFieldName(section, f, fields[f].name.c_str()));
+  if (composition().common_gas_pressure()) PetscCall(add_carrier(section));
+  PetscCall(add_symmetries(section));
+  PetscCall(DMSetLocalSection(dm_, section));
+
+  prescribed_.clear();
+  std::vector<std::array<PetscReal, 3>> x;
+  for (PetscInt p = begin; p < end; ++p) {
+    for (PetscInt c = 0; c < 4; ++c) {
+      const PetscInt k = constraint_of[5 * p + c], f = c < 3 ? displacement : pressure;
+      PetscInt dof, offset;
+      if (k < 0 || f >= n_fields) continue;
+      PetscCall(PetscSectionGetFieldDof(section, p, f, &dof));
+      if (dof == 0) continue;
+      PetscCall(PetscSectionGetFieldOffset(section, p, f, &offset));
+      PetscCall(node_coordinates(dm_, p, dof / components[f], x));
+      for (std::size_t node = 0; node < x.size(); ++node) {
+        Prescribed value{};
+        value.component = static_cast<std::int16_t>(c < 3 ? c : 0);
+        value.dof = offset + static_cast<PetscInt>(node) * components[f] + value.component;
+        value.constraint = static_cast<std::int16_t>(k);
+        std::copy(x[node].begin(), x[node].end(), value.x);
+        prescribed_.push_back(value);
+      }
+    }
+  }
+  PetscCall(find_airway(constraint_of));
+  if (closes_rows_) PetscCall(find_carrier());
+  PetscInt n_known;
+  IS *rows;
+  PetscCall(DMCreateFieldIS(dm_, &n_known, nullptr, &rows));
+  field_rows_.resize(static_cast<std::size_t>(n_known));
+  for (PetscInt f = 0; f < n_known; ++f) *field_rows_[f].out() = rows[f];
+  PetscCall(PetscFree(rows));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Where an edge has two nodes, cells see them in the order of their own corners.
+PetscErrorCode Model::add_symmetries(PetscSection section) const
+{
+  DMHandle plain;
+  PetscSection known;
+
+  PetscFunctionBeginUser;
+  if (composition().elements().displacement < 3) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(DMClone(mesh_->dm(), plain.out())); // PETSc knows them for the sections that it makes
+  PetscCall(compat::copy_fields(dm_, plain));
+  PetscCall(DMCreateDS(plain));
+  PetscCall(DMGetLocalSection(plain, &known));
+  for (std::size_t f = 0; f < composition().fields().size(); ++f) {
+    PetscSectionSym symmetries;
+    PetscCall(PetscSectionGetFieldSym(known, static_cast<PetscInt>(f), &symmetries));
+    PetscCall(PetscSectionSetFieldSym(section, static_cast<PetscInt>(f), symmetries));
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// The airway's nodes, with their share of its area: the integrals of their basis functions.
+PetscErrorCode Model::find_airway(const std::vector<PetscInt> &constraint_of)
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
+  PetscSection section, global;
+  PetscInt begin, end;
+  std::vector<PetscInt> facets;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMGetLocalSection(dm_, &section));
+  PetscCall(DMGetGlobalSection(dm_, &global)); // made here, used by DMPlexGetPointGlobalField
+  PetscCall(DMPlexGetChart(dm_, &begin, &end));
+  std::map<PetscInt, PetscReal> share;
+  std::set<std::string> surfaces;
+  for (const Constraint &c : composition().constraints())
+    if (c.at_airway) surfaces.insert(c.surface);
+  closes_rows_ = !surfaces.empty() || composition().common_gas_pressure();
+  for (const std::string &surface : surfaces) {
+    PetscCall(mesh_->facets(surface, facets));
+    for (PetscInt facet : facets) {
+      PetscInt *closure = nullptr, n_closure;
+      PetscReal area;
+      PetscCall(DMPlexComputeCellGeometryFVM(dm_, facet, &area, nullptr, nullptr));
+      PetscCall(DMPlexGetTransitiveClosure(dm_, facet, PETSC_TRUE, &n_closure, &closure));
+      // the face, its edges, its vertices: a third each for the vertices of P1, for the edges of P2
+      const PetscInt first = composition().elements().pressure == 1 ? 4 : 1;
+      for (PetscInt j = first; j < first + 3; ++j) share[closure[2 * j]] += area / 3;
+      PetscCall(DMPlexRestoreTransitiveClosure(dm_, facet, PETSC_TRUE, &n_closure, &closure));
+    }
+  }
+  for (PetscInt p = begin; p < end && !surfaces.empty(); ++p) {
+    PetscInt dof, offset, row, row_end;
+    if (constraint_of[5 * p + 4] < 0 || constraint_of[5 * p + 3] >= 0) continue;
+    PetscCall(PetscSectionGetFieldDof(section, p, pressure, &dof));
+    if (dof == 0) continue;
+    PetscCall(PetscSectionGetFieldOffset(section, p, pressure, &offset));
+    PetscCall(DMPlexGetPointGlobalField(dm_, p, pressure, &row, &row_end));
+    airway_.push_back({p, offset, row < 0 ? -1 : row, share.count(p) ? share[p] : 0});
+  }
+  airway_area_ = 0;
+  for (const AirwayNode &node : airway_) {
+    airway_area_ += node.area;
+    if (node.row >= 0) closed_rows_.push_back(node.row);
+  }
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &airway_area_, 1, MPIU_REAL, MPI_SUM, comm));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Rebuilds the section with a dof of its own for the uniform gas pressure, on the first cell of the first rank that
+/// has one. It belongs to no field, so element loops do not see it.
+PetscErrorCode Model::add_carrier(SectionHandle &section)
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
+  SectionHandle wider;
+  PetscInt begin, end, cell_begin, cell_end, n_fields;
+  PetscMPIInt rank;
+
+  PetscFunctionBeginUser;
+  PulmoUserCheck(
+      own_, comm,
+      "-petscfe_type basic cannot carry the unknown gas pressure of a flow phase or a tube without -airflow; use the "
+      "default, pulmo");
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  PetscCall(DMPlexGetHeightStratum(dm_, 0, &cell_begin, &cell_end));
+  PetscMPIInt first = cell_end > cell_begin ? rank : PETSC_MPI_INT_MAX;
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &first, 1, MPI_INT, MPI_MIN, comm));
+  carrier_rank_ = first;
+  const PetscInt carrier = rank == first ? cell_begin : -1;
+  // as many dofs as every other mesh point has, so that the matrix keeps its block size; one of them is used
+  const PetscInt dofs = composition().fields()[displacement].components;
+
+  PetscCall(PetscSectionGetChart(section, &begin, &end));
+  PetscCall(PetscSectionGetNumFields(section, &n_fields));
+  PetscCall(PetscSectionCreate(comm, wider.out()));
+  PetscCall(PetscSectionSetNumFields(wider, n_fields));
+  PetscCall(PetscSectionSetChart(wider, begin, end));
+  for (PetscInt f = 0; f < n_fields; ++f) {
+    PetscInt components;
+    const char *name;
+    PetscCall(PetscSectionGetFieldComponents(section, f, &components));
+    PetscCall(PetscSectionSetFieldComponents(wider, f, components));
+    PetscCall(PetscSectionGetFieldName(section, f, &name));
+    PetscCall(PetscSectionSetFieldName(wider, f, name));
+  }
+  PetscInt dof;
+  for (PetscInt p = begin; p < end; ++p) {
+    PetscCall(PetscSectionGetDof(section, p, &dof));
+    PetscCall(PetscSectionSetDof(wider, p, dof + (p == carrier ? dofs : 0)));
+    PetscCall(PetscSectionGetConstraintDof(section, p, &dof));
+    PetscCall(PetscSectionSetConstraintDof(wider, p, dof));
+    for (PetscInt f = 0; f < n_fields; ++f) {
+      PetscCall(PetscSectionGetFieldDof(section, p, f, &dof));
+      PetscCall(PetscSectionSetFieldDof(wider, p, f, dof));
+      PetscCall(PetscSectionGetFieldConstraintDof(section, p, f, &dof));
+      PetscCall(PetscSectionSetFieldConstraintDof(wider, p, f, dof));
+    }
+  }
+  PetscCall(PetscSectionSetUp(wider));
+  for (PetscInt p = begin; p < end; ++p) {
+    const PetscInt *which;
+    PetscCall(PetscSectionGetConstraintDof(section, p, &dof));
+    if (dof == 0) continue;
+    PetscCall(PetscSectionGetConstraintIndices(section, p, &which));
+    PetscCall(PetscSectionSetConstraintIndices(wider, p, which));
+    for (PetscInt f = 0; f < n_fields; ++f) {
+      PetscCall(PetscSectionGetFieldConstraintIndices(section, p, f, &which));
+      PetscCall(PetscSectionSetFieldConstraintIndices(wider, p, f, which));
+    }
+  }
+  section = std::move(wider);
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::find_carrier()
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
+  PetscMPIInt rank;
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  if (composition().common_gas_pressure()) {
+    PetscSection global;
+    PetscInt cell, dof;
+    PetscCall(DMGetGlobalSection(dm_, &global));
+    PetscCall(DMPlexGetHeightStratum(dm_, 0, &cell, nullptr));
+    if (rank == carrier_rank_) {
+      PetscCall(PetscSectionGetDof(global, cell, &dof));
+      PetscCall(PetscSectionGetOffset(global, cell, &carrier_));
+      for (PetscInt d = 0; d < dof; ++d) {
+        closed_rows_.push_back(carrier_ + d);
+        if (d > 0) idle_rows_.push_back(carrier_ + d);
+      }
+    }
+  } else {
+    PetscMPIInt first = closed_rows_.empty() ? PETSC_MPI_INT_MAX : rank;
+    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &first, 1, MPI_INT, MPI_MIN, comm));
+    carrier_rank_ = first;
+    if (rank == first) carrier_ = closed_rows_.front();
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::set_step(const Stage &stage, PetscReal airway_pressure, PetscReal airway_flow)
+{
+  const PetscReal L = mesh_->length();
+
+  PetscFunctionBeginUser;
+  const PetscReal load = step_.load;
+  step_ = Step(stage, airway_pressure, airway_area_ > 0 ? -airway_flow / airway_area_ : 0);
+  step_.load = load;
+  row_scale_[displacement] = 1 / (modulus_ * L * L);
+  if (row_scale_.size() > pressure) row_scale_[pressure] = (stage.slope > 0 ? 1 / stage.slope : stage.dt) / (L * L * L);
+  PetscCall(pack_constants());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Composition::check_parameters(MPI_Comm comm) const
+{
+  PetscFunctionBeginUser;
+  for (const Reader &reader : readers_) {
+    const auto n = std::count_if(parameters_.begin(), parameters_.end(), [&](const ParameterBlock &block) {
+      return constants::tag(block.owner) == constants::tag(reader.owner);
+    });
+    PetscCheck(n > 0, comm, PETSC_ERR_ARG_WRONGSTATE,
+               "effect %s: '%s' reads the parameters of '%s', which no effect hands over; call "
+               "Composition::parameters in terms()",
+               reader.effect.c_str(), reader.term.c_str(), reader.owner);
+    PetscCheck(n == 1, comm, PETSC_ERR_ARG_WRONGSTATE,
+               "effect %s: the parameters of '%s' are handed over %d times; give each block an owner of its own",
+               reader.effect.c_str(), reader.owner, (int)n);
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscInt Composition::constant_at(const PetscReal *parameter, const char **owner) const
+{
+  PetscInt offset = 1 + 2 * static_cast<PetscInt>(parameters_.size() + 1) +
+                    static_cast<PetscInt>(sizeof(Step) / sizeof(PetscScalar)); // as constants() lists them
+  for (const ParameterBlock &block : parameters_) {
+    if (!std::less<>()(parameter, block.data) && std::less<>()(parameter, block.data + block.count)) {
+      *owner = block.owner;
+      return offset + static_cast<PetscInt>(parameter - block.data);
+    }
+    offset += block.count;
+  }
+  return -1;
+}
+
+std::vector<std::string> Composition::surfaces_that_read(const char *owner) const
+{
+  std::vector<std::string> list;
+  for (const Reader &reader : readers_)
+    if (!reader.surface.empty() && constants::tag(reader.owner) == constants::tag(owner))
+      list.push_back(reader.surface);
+  return list;
+}
+
+std::vector<PetscScalar> Composition::constants(const Step &step) const
+{
+  std::vector<ParameterBlock> blocks = parameters_;
+
+  // the step is asked for by every kernel: first in the directory
+  blocks.insert(blocks.begin(),
+                {Step::owner, reinterpret_cast<const PetscScalar *>(&step), sizeof(Step) / sizeof(PetscScalar)});
+  const auto n = static_cast<PetscInt>(blocks.size());
+  std::vector<PetscScalar> all(1, static_cast<PetscScalar>(n));
+  PetscInt offset = 1 + 2 * n;
+  for (const ParameterBlock &block : blocks) {
+    all.push_back(constants::tag(block.owner));
+    all.push_back(static_cast<PetscScalar>(offset));
+    offset += block.count;
+  }
+  for (const ParameterBlock &block : blocks) all.insert(all.end(), block.data, block.data + block.count);
+  return all;
+}
+
+PetscErrorCode Model::pack_constants()
+{
+  PetscDS ds;
+
+  PetscFunctionBeginUser;
+  constants_ = composition().constants(step_);
+  const auto n = static_cast<PetscInt>(constants_.size());
+  PetscCall(DMGetDS(dm_, &ds));
+  PetscCall(PetscDSSetConstants(ds, n, constants_.data()));
+  if (stock_dm_) {
+    PetscCall(DMGetDS(stock_dm_, &ds));
+    PetscCall(PetscDSSetConstants(ds, n, constants_.data()));
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+const PetscScalar *Model::constants_at(PetscInt cell, const std::string &surface) const
+{
+  const ParameterFields *varying = composition().varying();
+  if (!varying) return constants_.data();
+  local_constants_ = constants_;
+  varying->patch(cell, surface, local_constants_);
+  return local_constants_.data();
+}
+
+PetscErrorCode Model::constrain(PetscReal t, Vec local) const
+{
+  PetscFunctionBeginUser;
+  WriteArray x(local);
+  for (const Prescribed &p : prescribed_) {
+    PetscScalar value[3] = {0, 0, 0};
+    composition().constraints()[p.constraint].value(t, p.x, value);
+    x[p.dof] = value[p.component];
+  }
+  if (airway_held_)
+    for (const AirwayNode &node : airway_) x[node.dof] = step_.gas_pressure;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::constrain_rate(Vec local, Vec before, PetscReal dt, Vec rate) const
+{
+  PetscFunctionBeginUser;
+  const ReadArray now(local), then(before);
+  WriteArray r(rate);
+  for (const Prescribed &p : prescribed_) r[p.dof] = (now[p.dof] - then[p.dof]) / dt;
+  if (airway_held_)
+    for (const AirwayNode &node : airway_) r[node.dof] = (now[node.dof] - then[node.dof]) / dt;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::close_rows(Vec X, Vec F) const
+{
+  PetscFunctionBeginUser;
+  if (airway_held_ && !closed_rows_.empty()) {
+    PetscInt first;
+    PetscCall(VecGetOwnershipRange(F, &first, nullptr));
+    const ReadArray x(X);
+    WriteArray f(F);
+    for (const PetscInt row : closed_rows_) {
+      const PetscScalar off = x[row - first] - step_.gas_pressure;
+      f[row - first] = std::abs(off) > rounding * std::abs(step_.gas_pressure) ? off : 0;
+    }
+    for (const PetscInt row : idle_rows_) f[row - first] = x[row - first];
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::residual_sums(Vec F, ResidualSums &sums) const
+{
+  PetscInt first;
+
+  PetscFunctionBeginUser;
+  sums.absolute.assign(field_rows_.size(), 0);
+  sums.net.assign(field_rows_.size(), 0);
+  PetscCall(VecGetOwnershipRange(F, &first, nullptr));
+  {
+    const ReadArray f(F);
+    for (std::size_t field = 0; field < field_rows_.size(); ++field) {
+      const PetscInt *rows;
+      PetscInt n;
+      PetscCall(ISGetLocalSize(field_rows_[field], &n));
+      PetscCall(ISGetIndices(field_rows_[field], &rows));
+      for (PetscInt i = 0; i < n; ++i) {
+        const PetscReal value = f[rows[i] - first] / row_scale_[field];
+        sums.absolute[field] += std::abs(value);
+        sums.net[field] += value;
+      }
+      PetscCall(ISRestoreIndices(field_rows_[field], &rows));
+    }
+  }
+  for (std::vector<PetscReal> *sum : {&sums.absolute, &sums.net})
+    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, sum->data(), static_cast<PetscMPIInt>(sum->size()), MPIU_REAL, MPI_SUM,
+                               PetscObjectComm((PetscObject)F)));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::loads(PetscReal t, Vec local, Vec F, PetscReal &force, PetscReal &gas)
+{
+  PetscSection section;
+  PetscInt begin, end;
+  Vec rest, zero, local_loads, loads;
+  ResidualSums sums;
+  PetscReal borne[2] = {0, 0}; // by field
+
+  PetscFunctionBeginUser;
+  {
+    const ReadArray f(F);
+    for (const Prescribed &p : prescribed_) {
+      const PetscInt field = composition().constraints()[p.constraint].field;
+      borne[field] += std::abs(f[p.dof]) / row_scale_[field];
+    }
+  }
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, borne, 2, MPIU_REAL, MPI_SUM, PetscObjectComm((PetscObject)(DM)dm_)));
+  for (Vec *v : {&rest, &zero, &local_loads}) PetscCall(DMGetLocalVector(dm_, v));
+  PetscCall(DMGetGlobalVector(dm_, &loads));
+  PetscCall(VecZeroEntries(zero));
+  PetscCall(VecCopy(local, rest));
+  PetscCall(DMGetLocalSection(dm_, &section));
+  PetscCall(PetscSectionGetChart(section, &begin, &end));
+  {
+    WriteArray x(rest);
+    for (PetscInt p = begin; p < end; ++p) {
+      PetscInt dofs, offset;
+      PetscCall(PetscSectionGetFieldDof(section, p, displacement, &dofs));
+      PetscCall(PetscSectionGetFieldOffset(section, p, displacement, &offset));
+      std::fill_n(x.data() + offset, dofs, 0);
+    }
+  }
+  const auto sum_at = [&](Vec state) -> PetscErrorCode {
+    PetscFunctionBeginUser;
+    PetscCall(residual(t, state, zero, local_loads));
+    PetscCall(VecZeroEntries(loads));
+    PetscCall(DMLocalToGlobal(dm_, local_loads, ADD_VALUES, loads));
+    PetscCall(residual_sums(loads, sums));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  };
+  PetscCall(sum_at(rest));
+  force = sums.absolute[displacement] + borne[displacement];
+  gas = 0;
+  if (sums.absolute.size() > pressure) {
+    PetscCall(sum_at(zero));
+    gas = sums.absolute[pressure] + borne[pressure];
+  }
+  PetscCall(DMRestoreGlobalVector(dm_, &loads));
+  for (Vec *v : {&rest, &zero, &local_loads}) PetscCall(DMRestoreLocalVector(dm_, v));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::carrier_value(Vec X, PetscReal &value) const
+{
+  PetscFunctionBeginUser;
+  value = 0;
+  if (carrier_ >= 0) {
+    PetscInt first;
+    PetscCall(VecGetOwnershipRange(X, &first, nullptr));
+    value = ReadArray(X)[carrier_ - first];
+  }
+  PetscCallMPI(MPI_Bcast(&value, 1, MPIU_REAL, carrier_rank_, PetscObjectComm((PetscObject)X)));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::set_carrier_value(Vec X, PetscReal value) const
+{
+  PetscFunctionBeginUser;
+  if (carrier_ >= 0) PetscCall(VecSetValue(X, carrier_, value, INSERT_VALUES));
+  PetscCall(VecAssemblyBegin(X));
+  PetscCall(VecAssemblyEnd(X));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::set_airway_nodes(Vec X, PetscReal value) const
+{
+  PetscInt first;
+
+  PetscFunctionBeginUser;
+  PetscCall(VecGetOwnershipRange(X, &first, nullptr));
+  {
+    WriteArray x(X);
+    for (const AirwayNode &node : airway_)
+      if (node.row >= 0) x[node.row - first] = value;
+  }
+  PetscCall(set_carrier_value(X, value));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::airway_mean_pressure(Vec local, PetscReal &mean) const
+{
+  PetscFunctionBeginUser;
+  const ReadArray x(local);
+  mean = 0;
+  for (const AirwayNode &node : airway_) mean += node.area * x[node.dof] / airway_area_;
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &mean, 1, MPIU_REAL, MPI_SUM, PetscObjectComm((PetscObject)(DM)dm_)));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::residual(PetscReal t, Vec x, Vec x_t, Vec F)
+{
+  PetscFunctionBeginUser;
+  PetscCall(VecZeroEntries(F));
+  if (stock_loops()) PetscCall(stock_residual(t, x, x_t, F));
+  PetscCall(assembly_.residual(stock_loops() ? Assembly::Part::facets : Assembly::Part::all, t, x, x_t,
+                               row_scale_.data(), F));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// PETSc's own loop over cells, then the scaling of the rows.
+PetscErrorCode Model::stock_residual(PetscReal t, Vec x, Vec x_t, Vec F)
+{
+  PetscFunctionBeginUser;
+  PetscCall(VecCopy(x_t, rate_));
+  PetscCall(DMPlexTSComputeIFunctionFEM(stock_dm_, t, x, x_t, F, nullptr));
+  WriteArray f(F);
+  PetscSection section;
+  PetscInt begin, end;
+  PetscCall(DMGetLocalSection(dm_, &section));
+  PetscCall(PetscSectionGetChart(section, &begin, &end));
+  for (PetscInt p = begin; p < end; ++p)
+    for (std::size_t field = 0; field < row_scale_.size(); ++field) {
+      PetscInt dof, offset;
+      PetscCall(PetscSectionGetFieldDof(section, p, (PetscInt)field, &dof));
+      PetscCall(PetscSectionGetFieldOffset(section, p, (PetscInt)field, &offset));
+      for (PetscInt d = 0; d < dof; ++d) f[offset + d] *= row_scale_[field];
+    }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::create_matrix(Mat *A) const
+{
+  PetscFunctionBeginUser;
+  PetscCall(pulmo::create_matrix(dm_, A));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, Mat A)
+{
+  PetscFunctionBeginUser;
+  if (stock_loops()) PetscCall(stock_jacobian(t, x, x_t, shift, A));
+  if (also_) PetscCall(also_->begin());
+  PetscCall(assembly_.jacobian(stock_loops() ? Assembly::Part::facets : Assembly::Part::all, t, x, x_t, shift,
+                               row_scale_.data(), A, also_));
+  if (also_) {
+    std::vector<PetscInt> closed;
+    if (airway_held_)
+      for (const AirwayNode &node : airway_) closed.push_back(node.point);
+    PetscCall(also_->end(closed));
+  }
+  if (closes_rows_ && airway_held_)
+    PetscCall(MatZeroRowsColumns(A, (PetscInt)closed_rows_.size(), closed_rows_.data(), 1, nullptr, nullptr));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// The same for the Jacobian.
+PetscErrorCode Model::stock_jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, Mat A)
+{
+  PetscFunctionBeginUser;
+  PetscCall(VecCopy(x_t, rate_));
+  PetscCall(DMPlexTSComputeIJacobianFEM(stock_dm_, t, x, x_t, shift, A, A, nullptr));
+  for (std::size_t field = 0; field < row_scale_.size(); ++field) {
+    ISHandle rows;
+    DMHandle unused;
+    const auto f = static_cast<PetscInt>(field);
+    PetscCall(DMCreateSubDM(dm_, 1, &f, rows.out(), unused.out()));
+    PetscCall(VecISSet(scale_, rows, row_scale_[field]));
+  }
+  PetscCall(MatDiagonalScale(A, scale_, nullptr));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::airway_flow(Vec F, PetscReal &flow) const
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
+  double sum = 0;
+
+  PetscFunctionBeginUser;
+  if (row_scale_.size() > pressure) {
+    const ReadArray f(F);
+    for (const AirwayNode &node : airway_) sum += f[node.dof] / row_scale_[pressure];
+  }
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &sum, 1, MPI_DOUBLE, MPI_SUM, comm));
+  flow = sum;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::reactions(Vec F, std::vector<std::array<PetscReal, 3>> &forces) const
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
+
+  PetscFunctionBeginUser;
+  forces.assign(composition().constraints().size(), {0, 0, 0});
+  const ReadArray f(F);
+  for (const Prescribed &p : prescribed_)
+    if (composition().constraints()[p.constraint].field == displacement)
+      forces[p.constraint][p.component] += f[p.dof] / row_scale_[displacement];
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, forces.data(), 3 * (PetscMPIInt)forces.size(), MPIU_REAL, MPI_SUM, comm));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace pulmo

@@ -1,0 +1,200 @@
+#include "pulmo/fem/sampling.hpp"
+
+#include "pulmo/mesh/mesh.hpp"
+
+#include <cmath>
+#include <numeric>
+
+namespace pulmo {
+
+namespace {
+
+/// Volume of PETSc's reference tetrahedron, whose corners are (-1, -1, -1), (1, -1, -1), ...
+constexpr PetscReal reference_volume = 4. / 3;
+
+/// Relative weights of a rule and its points.
+PetscErrorCode rule_points(PetscQuadrature rule, std::vector<PetscReal> &xi, std::vector<PetscReal> &weights)
+{
+  PetscInt dim, n;
+  const PetscReal *points, *w;
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscQuadratureGetData(rule, &dim, nullptr, &n, &points, &w));
+  xi.assign(points, points + dim * n);
+  weights.assign(w, w + n);
+  const PetscReal total = std::accumulate(w, w + n, PetscReal(0));
+  for (PetscReal &weight : weights) weight /= total;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Gradients (4 x 3, 1/mm) of the barycentric coordinates of a cell.
+void barycentric_gradients(const PetscReal inverse[9], PetscReal g[12])
+{
+  for (int d = 0; d < 3; ++d) {
+    g[d] = 0;
+    for (int i = 0; i < 3; ++i) {
+      g[3 * (i + 1) + d] = inverse[3 * i + d] / 2;
+      g[d] -= g[3 * (i + 1) + d];
+    }
+  }
+}
+
+} // namespace
+
+PetscErrorCode Sampling::setup(const Model &model)
+{
+  PetscDS ds;
+  PetscFE fe;
+  PetscQuadrature rule, face_rule;
+  PetscInt begin, end;
+  std::vector<PetscReal> xi, eta, weights, face_weights;
+
+  PetscFunctionBeginUser;
+  dm_ = model.dm();
+  assembly_ = &model.assembly();
+  gas_ = model.composition().fields().size() > pressure;
+  PetscCall(DMGetDS(dm_, &ds));
+  PetscCall(DMPlexGetHeightStratum(dm_, 0, &begin, &end));
+  for (PetscInt c = begin; c < end; ++c) {
+    Element e{};
+    PetscReal det;
+    PetscCall(DMPlexComputeCellGeometryAffineFEM(dm_, c, e.v0, e.J, e.inverse, &det));
+    e.cell = c - begin;
+    e.measure = det * reference_volume;
+    cells_.push_back(e);
+  }
+
+  PetscCall(PetscDSGetDiscretization(ds, displacement, (PetscObject *)&fe));
+  PetscCall(PetscFEGetQuadrature(fe, &rule));
+  PetscCall(PetscFEGetFaceQuadrature(fe, &face_rule));
+  PetscCall(rule_points(rule, xi, weights));
+  PetscCall(add_table(xi, weights));
+  // the rule of the faces is symmetric: any order of a face's corners gives the same points
+  PetscCall(rule_points(face_rule, eta, face_weights));
+  for (int opposite = 0; opposite < 4; ++opposite) {
+    xi.clear();
+    for (std::size_t q = 0; q < face_weights.size(); ++q) {
+      const PetscReal a = (eta[2 * q] + 1) / 2, b = (eta[2 * q + 1] + 1) / 2;
+      PetscReal lambda[4] = {0, 0, 0, 0};
+      lambda[(opposite + 1) % 4] = 1 - a - b;
+      lambda[(opposite + 2) % 4] = a;
+      lambda[(opposite + 3) % 4] = b;
+      for (int d = 0; d < 3; ++d) xi.push_back(2 * lambda[d + 1] - 1);
+    }
+    PetscCall(add_table(xi, face_weights));
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Sampling::add_table(const std::vector<PetscReal> &xi, const std::vector<PetscReal> &weights)
+{
+  PetscDS ds;
+  Table table;
+  const auto n = static_cast<PetscInt>(weights.size());
+
+  PetscFunctionBeginUser;
+  table.weights = weights;
+  table.xi = xi;
+  PetscCall(DMGetDS(dm_, &ds));
+  for (PetscInt field = 0; field <= (gas_ ? pressure : displacement); ++field) {
+    PetscFE fe;
+    PetscTabulation T;
+    std::vector<PetscReal> &values = field == displacement ? table.u : table.p;
+    std::vector<PetscReal> &gradients = field == displacement ? table.du : table.dp;
+    PetscCall(PetscDSGetDiscretization(ds, field, (PetscObject *)&fe));
+    PetscCall(PetscFECreateTabulation(fe, 1, n, xi.data(), 1, &T));
+    const PetscInt nodes = T->Nb / T->Nc; // a vector field repeats the scalar basis for each component
+    (field == displacement ? nodes_ : corners_) = nodes;
+    for (PetscInt i = 0; i < n * nodes; ++i) {
+      const PetscInt entry = ((i / nodes) * T->Nb + (i % nodes) * T->Nc) * T->Nc;
+      values.push_back(T->T[0][entry]);
+      gradients.insert(gradients.end(), T->T[1] + entry * 3, T->T[1] + entry * 3 + 3);
+    }
+    PetscCall(PetscTabulationDestroy(&T));
+  }
+  tables_.push_back(std::move(table));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Sampling::surface(const Mesh &mesh, const std::string &name, std::vector<Element> &facets) const
+{
+  PetscInt cell_begin;
+  std::vector<PetscInt> points;
+
+  PetscFunctionBeginUser;
+  facets.clear();
+  PetscCall(DMPlexGetHeightStratum(dm_, 0, &cell_begin, nullptr));
+  PetscCall(mesh.facets(name, points));
+  for (PetscInt point : points) {
+    const PetscInt *support;
+    PetscReal area, centre[3], gradients[12], least = PETSC_MAX_REAL;
+    PetscCall(DMPlexGetSupport(dm_, point, &support));
+    PetscCall(DMPlexComputeCellGeometryFVM(dm_, point, &area, centre, nullptr));
+    Element e = cells_[support[0] - cell_begin];
+    barycentric_gradients(e.inverse, gradients);
+    PetscInt opposite = 0;
+    for (int k = 0; k < 4; ++k) { // the facet lies where the coordinate of the opposite corner vanishes
+      PetscReal lambda = k == 0 ? 1 : 0;
+      for (int d = 0; d < 3; ++d) lambda += gradients[3 * k + d] * (centre[d] - e.v0[d]);
+      if (std::abs(lambda) < least) {
+        least = std::abs(lambda);
+        opposite = k;
+      }
+    }
+    const PetscReal *g = &gradients[3 * opposite], slope = std::hypot(g[0], g[1], g[2]);
+    e.table = 1 + opposite;
+    e.measure = area;
+    for (int d = 0; d < 3; ++d) e.normal[d] = -g[d] / slope;
+    facets.push_back(e);
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+void Sampling::sample(const Element &e, const PetscScalar *x, std::vector<Sample> &samples) const
+{
+  const Table &t = tables_[e.table];
+  const PetscInt *dofs = assembly_->cell_dofs(e.cell);
+
+  samples.resize(t.weights.size());
+  for (std::size_t q = 0; q < samples.size(); ++q) {
+    Sample &s = samples[q];
+    PetscScalar A[9] = {0}, H[9], b[3] = {0, 0, 0};
+    for (int d = 0; d < 3; ++d) {
+      s.u[d] = s.grad_p[d] = s.u_t[d] = s.grad_p_t[d] = 0;
+      s.x[d] = e.v0[d];
+      for (int i = 0; i < 3; ++i) s.x[d] += e.J[3 * d + i] * (t.xi[3 * q + i] + 1);
+    }
+    for (PetscInt a = 0; a < nodes_; ++a) {
+      const PetscReal N = t.u[q * nodes_ + a], *dN = &t.du[3 * (q * nodes_ + a)];
+      for (int i = 0; i < 3; ++i) {
+        const PetscScalar value = x[dofs[3 * a + i]];
+        s.u[i] += value * N;
+        for (int d = 0; d < 3; ++d) A[3 * i + d] += value * dN[d];
+      }
+    }
+    for (int i = 0; i < 3; ++i)
+      for (int d = 0; d < 3; ++d)
+        H[3 * i + d] = A[3 * i] * e.inverse[d] + A[3 * i + 1] * e.inverse[3 + d] + A[3 * i + 2] * e.inverse[6 + d];
+    make_point_state(H, nullptr, s.state);
+    s.p = s.p_t = 0;
+    for (PetscInt a = 0; a < corners_; ++a) {
+      const PetscScalar value = x[dofs[3 * nodes_ + a]];
+      s.p += value * t.p[q * corners_ + a];
+      for (int d = 0; d < 3; ++d) b[d] += value * t.dp[3 * (q * corners_ + a) + d];
+    }
+    for (int d = 0; d < 3; ++d)
+      for (int i = 0; i < 3; ++i) s.grad_p[d] += b[i] * e.inverse[3 * i + d];
+  }
+}
+
+void Sampling::make_rates(const Sample &before, PetscReal dt, Sample &now)
+{
+  for (int i = 0; i < 9; ++i) now.state.H_rate[i] = (now.state.H[i] - before.state.H[i]) / dt;
+  for (int d = 0; d < 3; ++d) {
+    now.u_t[d] = (now.u[d] - before.u[d]) / dt;
+    now.grad_p_t[d] = (now.grad_p[d] - before.grad_p[d]) / dt;
+  }
+  now.p_t = (now.p - before.p) / dt;
+}
+
+} // namespace pulmo

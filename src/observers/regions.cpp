@@ -1,0 +1,121 @@
+#include "pulmo/observers/regions.hpp"
+
+#include "pulmo/base/units.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+namespace pulmo {
+
+namespace {
+
+/// Moments of J - 1 and of p - P over a region.
+enum Moment { J1, J2, p1, p2, n_moments };
+
+/// Two times of a run closer than this share are the same.
+constexpr double same_time = 1e-9;
+
+} // namespace
+
+PetscErrorCode RegionAudit::setup()
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)model_.dm());
+
+  PetscFunctionBeginUser;
+  PetscCall(scene_.mesh().regions(regions_));
+  const std::size_t whole = regions_.size();
+  regions_of_.assign(sampling_.cells().size(), {});
+  for (std::size_t r = 0; r < whole; ++r)
+    for (PetscInt c : regions_[r].cells) regions_of_[c].push_back(r);
+  volumes_.assign(whole + 1, 0);
+  for (std::size_t c = 0; c < regions_of_.size(); ++c) {
+    regions_of_[c].push_back(whole);
+    for (std::size_t r : regions_of_[c]) volumes_[r] += sampling_.cells()[c].measure / units::mm3_per_ml;
+  }
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, volumes_.data(), static_cast<PetscMPIInt>(volumes_.size()), MPI_DOUBLE,
+                             MPI_SUM, comm));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode RegionAudit::observe(const StepReport &step)
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)model_.dm());
+  const double airway = step.row.pressure * units::kPa_per_cmH2O;
+  const bool gas = scene_.facts().airflow;
+  std::vector<double> sums(volumes_.size() * n_moments, 0);
+  std::vector<Sample> samples;
+  std::vector<RegionState> states(volumes_.size());
+
+  PetscFunctionBeginUser;
+  {
+    const ReadArray x(step.local);
+    for (std::size_t c = 0; c < regions_of_.size(); ++c) {
+      const Sampling::Element &e = sampling_.cells()[c];
+      const auto &weights = sampling_.weights(e);
+      double cell[n_moments] = {0, 0, 0, 0};
+      sampling_.sample(e, x.data(), samples);
+      for (std::size_t q = 0; q < weights.size(); ++q) {
+        const double w = weights[q] * e.measure, J = samples[q].state.J_minus_1, p = gas ? samples[q].p - airway : 0;
+        cell[J1] += w * J;
+        cell[J2] += w * J * J;
+        cell[p1] += w * p;
+        cell[p2] += w * p * p;
+      }
+      for (std::size_t r : regions_of_[c])
+        for (int m = 0; m < n_moments; ++m) sums[r * n_moments + m] += cell[m];
+    }
+  }
+  PetscCallMPI(
+      MPI_Allreduce(MPI_IN_PLACE, sums.data(), static_cast<PetscMPIInt>(sums.size()), MPI_DOUBLE, MPI_SUM, comm));
+  for (std::size_t r = 0; r < states.size(); ++r) {
+    const double *sum = &sums[r * n_moments], V = volumes_[r] * units::mm3_per_ml;
+    const auto spread = [V](double first, double second) {
+      return std::sqrt(std::max(second / V - (first / V) * (first / V), 0.0));
+    };
+    states[r].volume_change = sum[J1] / units::mm3_per_ml;
+    states[r].mean_J = 1 + sum[J1] / V;
+    states[r].sd_J = spread(sum[J1], sum[J2]);
+    states[r].mean_pressure = (airway + sum[p1] / V) / units::kPa_per_cmH2O;
+    states[r].sd_pressure = spread(sum[p1], sum[p2]) / units::kPa_per_cmH2O;
+  }
+  rows_.push_back(std::move(states));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode RegionAudit::persist(Archive &archive, Vec)
+{
+  const std::vector<RegionState> empty(volumes_.size());
+
+  PetscFunctionBeginUser;
+  PetscCall(archive.table("regions", rows_, empty, [](std::vector<RegionState> &row, Cells &cells) {
+    for (RegionState &s : row) cells(s.volume_change, s.mean_J, s.sd_J, s.mean_pressure, s.sd_pressure);
+  }));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+std::vector<SignalRow> RegionAudit::complete(std::vector<SignalRow> rows) const
+{
+  const SceneFacts &facts = scene_.facts();
+  for (std::size_t i = 0; i < rows.size(); ++i) {
+    if (facts.airflow) rows[i].alveolar_pressure = rows_[i].back().mean_pressure;
+    rows[i].flow_resistance = facts.airflow || facts.tube;
+  }
+  if (facts.ventilator && rows.back().breath > 0) {
+    const double end = facts.ventilator->end_of_breath(rows.back().breath);
+    rows.back().cut = rows.back().time < end * (1 - same_time);
+  }
+  return rows;
+}
+
+double RegionAudit::ventilation(const BreathRows &breath, std::size_t region) const
+{
+  return state(breath.fullest, region).volume_change - state(breath.first, region).volume_change;
+}
+
+std::optional<double> RegionAudit::ventilation_share(const BreathRows &breath, std::size_t region) const
+{
+  const double whole = ventilation(breath, regions_.size());
+  return whole != 0 ? std::optional<double>(ventilation(breath, region) / whole) : std::nullopt;
+}
+
+} // namespace pulmo

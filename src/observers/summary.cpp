@@ -1,0 +1,272 @@
+#include "pulmo/base/units.hpp"
+#include "pulmo/fem/free_boundary.hpp"
+#include "pulmo/observers/output.hpp"
+
+#include <nlohmann/json.hpp>
+
+#include <fstream>
+
+namespace pulmo {
+
+namespace {
+
+using Json = nlohmann::ordered_json;
+
+Json optional_json(const std::optional<double> &v)
+{
+  return v ? Json(*v) : Json(nullptr);
+}
+
+/// A breath; one that was cut has null for each number, and the fit over the rows that there are.
+Json breath_json(const std::vector<SignalRow> &rows, const BreathRows &b, const std::optional<double> &frc)
+{
+  const ClinicalNumbers numbers = clinical_numbers(rows, b.first, b.last);
+  Json json;
+  json["complete"] = b.complete;
+  json["start_s"] = rows[b.first].time;
+  json["end_of_inspiration_s"] = b.complete ? Json(rows[b.fullest].time) : Json(nullptr);
+  json["end_s"] = rows[b.last].time;
+  for (const ClinicalEntry &e : clinical_entries(numbers, frc))
+    json[e.key] = b.complete ? optional_json(e.value) : Json(nullptr);
+  if (!b.complete)
+    json["fit_until_cut"] = {{"compliance_ml_per_cmH2O", optional_json(numbers.compliance)},
+                             {"resistance_cmH2O_s_per_l", optional_json(numbers.resistance)}};
+  return json;
+}
+
+/// The end of every pause of the run.
+Json static_curve(const std::vector<SignalRow> &rows)
+{
+  Json curve = Json::array();
+  for (const StaticPoint &point : static_points(rows, 0, rows.size() - 1)) {
+    const SignalRow &r = rows[point.row];
+    curve.push_back({{"time_s", r.time},
+                     {"phase", point.phase},
+                     {"volume_ml", r.volume},
+                     {"pressure_cmH2O", r.machine_pressure()}});
+  }
+  return curve;
+}
+
+/// Rows of the balance with their signs as listed.
+Json energy_json(const EnergyAudit &audit, const EnergyBalance &balance)
+{
+  Json json;
+  json["ventilator_work"] = balance.ventilator_work;
+  for (std::size_t i = 0; i < balance.accounts.size(); ++i) json[audit.accounts()[i].name] = balance.accounts[i];
+  json["residual"] = balance.residual;
+  json["residual_relative"] = balance.relative_residual();
+  return json;
+}
+
+Json regions_json(const RegionAudit &audit, const BreathRows &breath, bool gas)
+{
+  Json json = Json::object();
+  for (std::size_t r = 0; r < audit.regions().size(); ++r) {
+    const RegionState &s = audit.state(breath.fullest, r);
+    const auto pressure_json = [gas](double p) { return gas ? Json(p) : Json(nullptr); };
+    json[audit.regions()[r].name] = {{"number", r + 1},
+                                     {"connected_body", audit.regions()[r].body},
+                                     {"reference_volume_ml", audit.volume(r)},
+                                     {"ventilation_ml", audit.ventilation(breath, r)},
+                                     {"ventilation_share", optional_json(audit.ventilation_share(breath, r))},
+                                     {"jacobian_mean", s.mean_J},
+                                     {"jacobian_sd", s.sd_J},
+                                     {"alveolar_pressure_mean_cmH2O", pressure_json(s.mean_pressure)},
+                                     {"alveolar_pressure_sd_cmH2O", pressure_json(s.sd_pressure)}};
+  }
+  return json;
+}
+
+/// Where and why a run could not go on.
+Json diagnosis_json(const Diagnosis &d)
+{
+  Json json = {{"where", d.name()},
+               {"mean_jacobian", d.mean_J},
+               {"inflation_stiffness_cmH2O", d.inflation / units::kPa_per_cmH2O},
+               {"acoustic_stiffness_kPa", d.acoustic},
+               {"acoustic_stiffness_at_rest_kPa", d.acoustic_at_rest},
+               {"not_elliptic_volume_share", d.lost_share},
+               {"worst_cell_mm", nullptr},
+               {"distance_from_rim_mm", nullptr}};
+  if (d.worst) json["worst_cell_mm"] = {d.worst->where[0], d.worst->where[1], d.worst->where[2]};
+  if (d.from_rim) json["distance_from_rim_mm"] = *d.from_rim;
+  return json;
+}
+
+/// Boundary that no effect uses.
+Json free_boundary_json(const std::vector<FreeBoundary> &parts)
+{
+  Json list = Json::array();
+  for (const FreeBoundary &p : parts)
+    list.push_back({{"name", p.name.empty() ? Json(nullptr) : Json(p.name)},
+                    {"area_mm2", p.area},
+                    {"share", p.share},
+                    {"centroid_mm", p.centroid},
+                    {"lowest_mm", p.lowest},
+                    {"highest_mm", p.highest}});
+  return list;
+}
+
+/// Error bars by the key of their number, and the runs they come from.
+Json errors_json(const ErrorReport &report)
+{
+  Json json;
+  for (const ErrorBar &bar : report.bars)
+    json["numbers"][bar.entry.key] = {
+        {"value", *bar.entry.value},         {"error", optional_json(bar.total())},
+        {"time", optional_json(bar.time)},   {"time_order", optional_json(bar.time_order)},
+        {"space", optional_json(bar.space)}, {"solver", optional_json(bar.solver)}};
+  json["runs"] = Json::array();
+  for (const ErrorLevel &level : report.levels) {
+    Json run = {{"name", level.name},      {"dt_s", level.dt},     {"cells", level.cells},
+                {"dofs", level.dofs},      {"steps", level.steps}, {"reference_volume_ml", level.volume},
+                {"seconds", level.seconds}};
+    if (!level.failure.empty()) run["failure"] = level.failure;
+    for (const ClinicalEntry &e : level.numbers) run["numbers"][e.key] = optional_json(e.value);
+    json["runs"].push_back(run);
+  }
+  json["extra_seconds"] = report.extra_seconds();
+  return json;
+}
+
+} // namespace
+
+std::string why_no_numbers(const Scene &scene, const std::vector<SignalRow> &rows)
+{
+  if (!scene.facts().ventilator->breathes())
+    return "no phase of the programme begins a breath: name one 'inspiration', or add the word 'breath' to its line";
+  return breath_rows(rows).empty() ? "the run ends before its first breath" : "the run ends within its first breath";
+}
+
+PetscErrorCode write_summary(const Options &options, const Output &output, const Scene &scene, const Model &model,
+                             const Simulation &simulation, const Audits &audits, bool finished)
+{
+  const MPI_Comm comm = options.comm();
+  PetscMPIInt rank, size;
+  PetscInt dofs;
+  OptionList used;
+  std::ostringstream f;
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  PetscCallMPI(MPI_Comm_size(comm, &size));
+  PetscCall(VecGetSize(simulation.state(), &dofs));
+  std::vector<FreeBoundary> free_boundary;
+  PetscCall(find_free_boundary(model.composition(), free_boundary));
+  PetscCall(options.all_used(used));
+  const std::string file = output.path(finished ? "summary.json" : "failure.json");
+  if (rank == 0) {
+    Json json;
+    json["finished"] = finished;
+    if (!finished) json["failure"] = simulation.failure_text();
+    if (!finished) json["diagnosis"] = diagnosis_json(simulation.diagnosis());
+    const auto frc = scene.functional_residual_capacity();
+    const std::vector<SignalRow> rows = audits.regions.complete(simulation.rows());
+    if (scene.facts().ventilator) {
+      const auto complete = complete_breaths(rows);
+      for (const ClinicalEntry &e : overall_entries(rows, frc)) json[e.key] = optional_json(e.value);
+      json["numbers_of_breath"] = complete.empty() ? Json(nullptr) : Json(rows[complete.back().last].breath);
+      if (complete.empty()) json["why_no_numbers"] = why_no_numbers(scene, rows);
+      const auto unsteady = unsteadiness(rows);
+      json["steady"] = unsteady ? Json(unsteady->steady()) : Json(nullptr);
+      json["steady_change"] = unsteady ? Json(unsteady->change) : Json(nullptr);
+      json["unsettled_volume_ml"] = optional_json(unsettled_volume(rows));
+      json["static_curve"] = static_curve(rows);
+      json["breaths"] = Json::array();
+      for (const BreathRows &b : breath_rows(rows)) {
+        Json breath = breath_json(rows, b, frc);
+        if (audits.energy) {
+          const auto &energy = audits.energy->rows();
+          const auto until = [&](std::size_t row) {
+            return b.complete ? energy_json(*audits.energy, energy[row] - energy[b.first]) : Json(nullptr);
+          };
+          breath["energy_j"] = until(b.last);
+          breath["inspiratory_energy_j"] = until(b.fullest);
+        }
+        json["breaths"].push_back(breath);
+      }
+    }
+    if (audits.errors) json["error_estimate"] = errors_json(*audits.errors);
+    if (audits.energy) json["energy_j"] = energy_json(*audits.energy, audits.energy->rows().back());
+    const bool gas = scene.facts().airflow || scene.facts().ventilator;
+    json["regions"] = regions_json(audits.regions, last_breath(rows), gas);
+    json["functional_residual_capacity_ml"] = optional_json(frc);
+    json["reference_volume_ml"] = scene.mesh().volume() / units::mm3_per_ml;
+    PetscReal total = 0;
+    Json areas;
+    for (const auto &[name, surface] : scene.mesh().surfaces()) {
+      total += surface.area;
+      areas[name] = surface.area;
+      if (name == "airway") json["airway_area_mm2"] = surface.area;
+    }
+    json["surface_area_mm2"] = total;
+    json["surface_areas_mm2"] = areas;
+    json["free_boundary"] = free_boundary_json(free_boundary);
+    if (scene.facts().airflow) json["mass_balance_error_ml"] = simulation.mass_balance_error() / units::mm3_per_ml;
+    if (model.composition().supported())
+      json["support_reaction_n"] = simulation.support_reaction() * units::newton_per_kPa_mm2;
+    if (model.composition().pinned()) json["pin_force_n"] = simulation.pins().largest() * units::newton_per_kPa_mm2;
+    json["min_jacobian"] = simulation.min_J();
+    if (scene.facts().airflow) json["min_porosity"] = 1 - (1 - scene.airflow().porosity()) / simulation.min_J();
+    json["end_time_s"] = simulation.time();
+    json["steps"] = simulation.rows().size() - 1;
+    json["rejected_steps"] = simulation.rejected_steps();
+    long newton = 0, krylov = 0;
+    for (const SignalRow &row : simulation.rows()) {
+      newton += row.newton;
+      krylov += row.krylov;
+    }
+    json["newton_iterations"] = newton;
+    json["krylov_iterations"] = krylov;
+    const StageSeconds &s = simulation.seconds();
+    json["wall_seconds"] = {{"setup", s.setup}, {"residual", s.residual}, {"jacobian", s.jacobian},
+                            {"solve", s.solve}, {"output", s.output},     {"total", s.total}};
+    json["cells"] = scene.mesh().cells();
+    json["dofs"] = dofs;
+    json["ranks"] = size;
+    json["tissue"] = scene.tissue().law().name();
+    json["effects"] = Json::array();
+    for (const Effect *effect : scene.active()) json["effects"].push_back(effect->name());
+    json["elements"] = scene.facts().elements.name();
+    json["integration"] = model.own_integration() ? "pulmo" : "basic";
+    json["version"] = PULMO_VERSION;
+    Json list;
+    for (const auto &[name, value] : used) list[name] = value;
+    json["options"] = list;
+    Json sources = Json::object(); // of what was given
+    for (const auto &[name, value] : used)
+      if (const std::string source = options.source(name); !source.empty()) sources[name] = source;
+    json["option_sources"] = sources;
+
+    f << json.dump(2, ' ', false, Json::error_handler_t::replace) << "\n";
+  }
+  PetscCall(write_text(comm, f.str(), file));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode write_energy(MPI_Comm comm, const Output &output, const Simulation &simulation, const EnergyAudit &audit)
+{
+  const std::string file = output.path("energy.csv");
+  PetscMPIInt rank;
+  std::ostringstream f;
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  if (rank == 0) {
+    f.precision(15);
+    f << "time_s,ventilator_work_j";
+    for (const EnergyAccount &a : audit.accounts()) f << "," << a.name << "_j";
+    f << ",residual_j\n";
+    for (std::size_t i = 0; i < audit.rows().size(); ++i) {
+      const EnergyBalance &b = audit.rows()[i];
+      f << simulation.rows()[i].time << "," << b.ventilator_work;
+      for (double a : b.accounts) f << "," << a;
+      f << "," << b.residual << "\n";
+    }
+  }
+  PetscCall(write_text(comm, f.str(), file));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace pulmo

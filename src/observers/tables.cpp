@@ -1,0 +1,199 @@
+// What a run prints at its end.
+#include "pulmo/base/units.hpp"
+#include "pulmo/observers/output.hpp"
+
+#include <cmath>
+#include <map>
+
+namespace pulmo {
+
+namespace {
+
+/// The balance of the last complete breath (without one: of the run), beside that of its inspiration.
+PetscErrorCode print_energy(MPI_Comm comm, const EnergyAudit &audit, const BreathRows &breath, const char *span)
+{
+  const EnergyBalance whole = audit.rows()[breath.last] - audit.rows()[breath.first],
+                      filling = audit.rows()[breath.fullest] - audit.rows()[breath.first];
+  const auto line = [comm](const std::string &name, double a, double b) {
+    return PetscPrintf(comm, "  %-28s %12.4g %12.4g J\n", name.c_str(), a, b);
+  };
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscPrintf(comm, "\n%-30s %12s %12s\n", "Energy", span, "inspiration"));
+  PetscCall(line("ventilator_work", whole.ventilator_work, filling.ventilator_work));
+  for (std::size_t i = 0; i < audit.accounts().size(); ++i)
+    if (whole.accounts[i] != 0 || filling.accounts[i] != 0)
+      PetscCall(line((audit.accounts()[i].kind == Energy::external ? "+ " : "- ") + audit.accounts()[i].name,
+                     whole.accounts[i], filling.accounts[i]));
+  PetscCall(line("= residual", whole.residual, filling.residual));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode print_regions(MPI_Comm comm, const RegionAudit &audit, const BreathRows &breath)
+{
+  PetscFunctionBeginUser;
+  PetscCall(PetscPrintf(comm, "\n%-18s %10s %14s %7s %8s %8s %12s %8s\n", "Region", "rest ml", "ventilation ml",
+                        "share", "J", "+-", "P cmH2O", "+-"));
+  for (std::size_t r = 0; r < audit.regions().size(); ++r) {
+    const RegionState &s = audit.state(breath.fullest, r);
+    PetscCall(PetscPrintf(comm, "  %-16s %10.4g %14.4g %6.1f%% %8.4f %8.4f %12.4g %8.2g\n",
+                          audit.regions()[r].name.c_str(), audit.volume(r), audit.ventilation(breath, r),
+                          100 * audit.ventilation_share(breath, r).value_or(0), s.mean_J, s.sd_J, s.mean_pressure,
+                          s.sd_pressure));
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// What the clinical numbers leave out, or what they are not yet.
+PetscErrorCode print_notes(MPI_Comm comm, const Scene &scene, const std::vector<SignalRow> &rows)
+{
+  const auto breaths = breath_rows(rows);
+  const auto unsettled = unsettled_volume(rows);
+  const auto unsteady = unsteadiness(rows);
+
+  PetscFunctionBeginUser;
+  if (!unsteady) PetscCall(PetscPrintf(comm, "\nNo numbers of a breath: %s.\n", why_no_numbers(scene, rows).c_str()));
+  if (breaths.empty()) PetscFunctionReturn(PETSC_SUCCESS);
+  const SignalRow &end = rows.back();
+  if (end.cut)
+    PetscCall(PetscPrintf(comm,
+                          "pulmo: note: the run ends at t = %.6g s, within breath %d, which would end at %.6g s: that "
+                          "breath has no numbers\n",
+                          end.time, end.breath, (double)scene.facts().ventilator->end_of_breath(end.breath)));
+  if (unsteady && !unsteady->steady())
+    PetscCall(PetscPrintf(comm,
+                          "pulmo: note: not a steady breath yet: %s: %.3g %% (steady: up to %.3g %%); more breaths, or "
+                          "longer ones, tell whether the numbers still change\n",
+                          unsteady->what.c_str(), 100 * unsteady->change, 100 * Unsteadiness::tolerated));
+  const double tidal = clinical_numbers(rows, breaths.back().first, breaths.back().last).tidal_volume;
+  if (unsettled && *unsettled > unsettled_tolerated * tidal)
+    PetscCall(PetscPrintf(comm,
+                          "pulmo: warning: the first breath starts at t = %.6g s before the lung is at rest: at least "
+                          "%.3g ml are still to come, %.3g %% of the tidal volume, and count as breath; give a longer "
+                          "-ventilator_settle_duration (in a programme: a longer phase before the first breath)\n",
+                          rows[breaths.front().first].time, *unsettled, 100 * *unsettled / tidal));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace
+
+PetscErrorCode print_numbers(MPI_Comm comm, const Output &output, const Scene &scene, const Simulation &simulation,
+                             const Audits &audits)
+{
+  const std::vector<SignalRow> rows = audits.regions.complete(simulation.rows());
+  const BreathRows breath = last_breath(rows);
+
+  PetscFunctionBeginUser;
+  const bool breathes = !complete_breaths(rows).empty();
+  if (breathes) {
+    PetscCall(PetscPrintf(comm, "\n%s tissue, %.0f ml at rest: clinical numbers of breath %d\n",
+                          scene.tissue().law().name(), (double)(scene.mesh().volume() / units::mm3_per_ml),
+                          rows[breath.last].breath));
+    for (const ClinicalEntry &e : audits.regions.numbers(simulation.rows())) {
+      if (!e.value) continue;
+      const double shown = std::abs(*e.value) < 1e-9 ? 0 : *e.value; // what the solver left of a zero
+      PetscCall(PetscPrintf(comm, "  %-28s %12.4g %s\n", e.label, shown, e.unit));
+    }
+  }
+  if (scene.facts().ventilator) PetscCall(print_notes(comm, scene, rows));
+  if (audits.energy) PetscCall(print_energy(comm, *audits.energy, breath, breathes ? "breath" : "run"));
+  if (audits.regions.regions().size() > 1) PetscCall(print_regions(comm, audits.regions, breath));
+  PetscCall(PetscPrintf(comm, "\nSmallest J %.4f", (double)simulation.min_J()));
+  if (scene.facts().airflow)
+    PetscCall(PetscPrintf(comm, "; air lost by the numbers: %.2g ml",
+                          (double)(simulation.mass_balance_error() / units::mm3_per_ml)));
+  PetscCall(PetscPrintf(comm, ".\nWrote %s, %s, %s.\n", output.path("signals.csv").c_str(),
+                        output.path("summary.json").c_str(), output.path("fields.xdmf").c_str()));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode print_error_bars(MPI_Comm comm, const ErrorReport &report)
+{
+  const auto part = [](const std::optional<double> &v) {
+    char text[32] = "?";
+    if (v) std::snprintf(text, sizeof(text), "%.2g", *v);
+    return std::string(text);
+  };
+  const ErrorLevel &run = report.levels.front();
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscPrintf(comm, "\n%-52s %9s %9s %9s\n", "Numerical errors (docs/accuracy/error_bars.md)", "time",
+                        "space", "solver"));
+  for (const ErrorBar &bar : report.bars)
+    PetscCall(PetscPrintf(comm, "  %-28s %10.4g ± %-7s %-10s %9s %9s %9s\n", bar.entry.label, *bar.entry.value,
+                          part(bar.total()).c_str(), bar.entry.unit, part(bar.time).c_str(), part(bar.space).c_str(),
+                          part(bar.solver).c_str()));
+  for (const ErrorLevel &level : report.levels)
+    if (!level.failure.empty())
+      PetscCall(PetscPrintf(comm, "  ?: %s: %s\n", level.name.c_str(), level.failure.c_str()));
+  PetscCall(PetscPrintf(comm, "The bars took %.3g s beside the %.3g s of the run (%+.0f %%):", report.extra_seconds(),
+                        run.seconds, 100 * report.extra_seconds() / run.seconds));
+  for (std::size_t i = 1; i < report.levels.size(); ++i)
+    PetscCall(
+        PetscPrintf(comm, "%s %s %.3g s", i > 1 ? "," : "", report.levels[i].name.c_str(), report.levels[i].seconds));
+  PetscCall(PetscPrintf(comm, ".\n"));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode print_ledger(MPI_Comm comm, const Scene &scene, const Model &model, const StageSeconds &seconds)
+{
+  const IntegrationLog &log = model.assembly().log();
+  const Composition &composition = model.composition();
+  const auto &fields = composition.fields();
+  std::map<std::string, double> spent;
+  double timed = 0;
+
+  PetscFunctionBeginUser;
+  auto left = log.seconds;
+  // what was timed, scaled up; a callback of several terms counts for the first that registered it
+  const double scale =
+      log.timed_cells > 0 ? (double)(log.residual_cells + log.jacobian_cells) / (double)log.timed_cells : 0;
+  const auto charge = [&](auto callback, const std::string &effect, double factor) {
+    const auto entry = left.find(reinterpret_cast<void (*)(void)>(callback));
+    if (!callback || entry == left.end()) return;
+    spent[effect] += entry->second * factor;
+    left.erase(entry);
+  };
+  for (const Term &t : composition.terms()) {
+    for (auto f : {t.f0, t.f1}) charge(f, t.effect, scale);
+    for (auto g : {t.g0, t.g1, t.g2, t.g3}) charge(g, t.effect, scale);
+    for (auto f : {t.bd_f0, t.bd_f1}) charge(f, t.effect, 1);
+    for (auto g : {t.bd_g0, t.bd_g1, t.bd_g2, t.bd_g3}) charge(g, t.effect, 1);
+  }
+  for (const auto &[effect, s] : spent) timed += s;
+  PetscCall(PetscPrintf(
+      comm, "\nEffects of this scene (seconds in its terms; one block of cells in %d is timed)\n%-16s %-22s %-9s %s\n",
+      (int)Assembly::timed_share, "effect", "fields", "seconds", "share of run, terms, blocks"));
+  for (const Effect *effect : scene.active()) {
+    const std::string name = effect->name();
+    std::string own_fields, terms;
+    for (const FieldSpec &f : fields)
+      if (f.effect == name) own_fields += (own_fields.empty() ? "" : ", ") + f.name + " P" + std::to_string(f.degree);
+    for (const Term &t : composition.terms()) {
+      if (t.effect != name) continue;
+      const std::string where = t.surface.empty() ? "" : " on " + t.surface;
+      if (t.trial < 0)
+        terms += "\n    " + t.name + where + "  (row " + fields[t.test].name + ")";
+      else
+        terms += "\n    " + t.name + where + "  [" + fields[t.test].name + ", " + fields[t.trial].name + "]";
+    }
+    for (const Constraint &c : composition.constraints())
+      if (c.effect == name)
+        terms += "\n    " + c.name + " prescribed" + (c.surface.empty() ? " at vertices" : " on " + c.surface) + "  (" +
+                 fields[c.field].name + ")";
+    PetscCall(PetscPrintf(comm, "%-16s %-22s %9.4f %5.1f %%%s\n", name.c_str(),
+                          own_fields.empty() ? "-" : own_fields.c_str(), spent[name],
+                          seconds.total > 0 ? 100 * spent[name] / seconds.total : 0, terms.c_str()));
+  }
+  const double residual_points = log.residual_cells > 0 ? (double)log.residual_calls / (double)log.residual_cells : 0;
+  const double jacobian_points = log.jacobian_cells > 0 ? (double)log.jacobian_calls / (double)log.jacobian_cells : 0;
+  PetscCall(PetscPrintf(
+      comm,
+      "callbacks per cell: residual %.0f, Jacobian %.0f; run: setup %.3f s, residual %.3f s, Jacobian %.3f s, "
+      "solve %.3f s, output %.3f s (callbacks above %.3f s)\n",
+      residual_points, jacobian_points, seconds.setup, seconds.residual, seconds.jacobian, seconds.solve,
+      seconds.output, timed));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace pulmo

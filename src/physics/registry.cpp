@@ -1,0 +1,39 @@
+#include "pulmo/physics/registry.hpp"
+
+#include "pulmo/physics/effects/airflow.hpp"
+#include "pulmo/physics/effects/chest_wall.hpp"
+#include "pulmo/physics/effects/lumen_pressure.hpp"
+#include "pulmo/physics/effects/pressure_damping.hpp"
+#include "pulmo/physics/effects/support.hpp"
+#include "pulmo/physics/effects/traction.hpp"
+#include "pulmo/physics/effects/tube.hpp"
+#include "pulmo/physics/tissue/berger.hpp"
+#include "pulmo/physics/tissue/birzle.hpp"
+#include "pulmo/physics/tissue/ma.hpp"
+#include "pulmo/physics/tissue/rausch.hpp"
+#include "pulmo/physics/tissue/yoshihara.hpp"
+
+namespace pulmo {
+
+Registry Registry::standard()
+{
+  Registry r;
+  // tissue laws; the first is the default
+  r.tissue_law<Birzle>();
+  r.tissue_law<Berger>();
+  r.tissue_law<Ma>();
+  r.tissue_law<Yoshihara>();
+  r.tissue_law<Rausch>();
+  // permeability laws; the first is the default
+  r.permeability_law<ConstantPermeability>();
+  // effects beside tissue, airflow and ventilator
+  r.effect<ChestWall>();
+  r.effect<LumenPressure>();
+  r.effect<PressureDamping>();
+  r.effect<Support>();
+  r.effect<Traction>();
+  r.effect<Tube>();
+  return r;
+}
+
+} // namespace pulmo

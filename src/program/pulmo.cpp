@@ -1,0 +1,384 @@
+#include "pulmo/pulmo.hpp"
+
+#include "pulmo/base/units.hpp"
+#include "pulmo/fem/free_boundary.hpp"
+#include "pulmo/fem/held.hpp"
+#include "pulmo/input/errors.hpp"
+#include "pulmo/observers/checkpoint.hpp"
+#include "pulmo/physics/parameter_fields.hpp"
+#include "pulmo/program/error_estimate.hpp"
+
+#include <algorithm>
+#include <csignal>
+#include <cstring>
+#include <sstream>
+#include <unistd.h>
+
+namespace pulmo {
+
+namespace {
+
+/// A crash, or a signal before the run heeds any: no lock is left, and the exit code is not PETSc's 59.
+PetscErrorCode handle_signal(int signal, void *)
+{
+  RunLock::abandon();
+  // what follows may wait for ever for a lock that the interrupted code holds
+  (void)std::signal(SIGALRM, [](int) { _exit(PULMO_COULD_NOT_GO_ON); });
+  (void)alarm(10); // s
+  if (signal == SIGTERM || signal == SIGHUP || signal == SIGQUIT)
+    (void)std::fprintf(stderr, "pulmo: error: stopped by signal %d (%s) while nothing was at hand that could be kept\n",
+                       signal, strsignal(signal));
+  else
+    (void)PetscError(PETSC_COMM_SELF, 0, nullptr, nullptr, PETSC_ERR_SIG, PETSC_ERROR_INITIAL,
+                     "pulmo crashed: signal %d (%s); please report it with the options and the mesh", signal,
+                     strsignal(signal));
+  (void)MPI_Abort(PETSC_COMM_WORLD, PULMO_COULD_NOT_GO_ON);
+  return PETSC_ERR_SIG;
+}
+
+/// Tissue stiffness that scales the equations: the largest diagonal entry of dP'/dF at F = I, kPa.
+PetscReal reference_modulus(const TissueLaw &law)
+{
+  const PetscScalar zero[9] = {0};
+  PetscScalar A[81];
+  PointState state;
+  make_point_state(zero, nullptr, state);
+  law.tangent(state, A);
+  PetscReal largest = 0;
+  for (int i = 0; i < 3; ++i)
+    for (int J = 0; J < 3; ++J) largest = std::max(largest, std::abs(A[27 * i + 9 * i + 4 * J]));
+  return largest > 0 ? largest : 1;
+}
+
+/// Ends a run that a signal asked to stop: a checkpoint, and how to go on.
+PetscErrorCode stop(Checkpoint &checkpoint, const Simulation &simulation, const char *signal)
+{
+  const MPI_Comm comm = PETSC_COMM_WORLD;
+  std::string complaint;
+
+  PetscFunctionBeginUser;
+  PulmoFailureCheck(simulation.rows().size() > 1, comm,
+                    "stopped by %s before the first step; nothing is lost: start the run again", signal);
+  PetscCall(checkpoint.write(complaint));
+  PulmoFailureCheck(complaint.empty(), comm, "stopped by %s after t = %.6g s, and %s", signal,
+                    (double)simulation.time(), complaint.c_str());
+  PulmoStopped(comm, "stopped by %s after t = %.6g s; to go on, give the same options and -restart %s", signal,
+               (double)simulation.time(), checkpoint.path().c_str());
+}
+
+/// A checkpoint of the last state of a run that failed. @p text: where it is, or why there is none.
+PetscErrorCode keep_last_state(Checkpoint &checkpoint, const Simulation &simulation, std::string &text)
+{
+  std::string complaint;
+
+  PetscFunctionBeginUser;
+  // the start is no loss, and at the end nothing is left to run
+  if (simulation.rows().size() < 2 || simulation.at_end()) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(checkpoint.write(complaint));
+  text = complaint.empty() ? " With another solver go on from there: -restart " + checkpoint.path() + "."
+                           : " No checkpoint: " + complaint + ".";
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Says so before the run if it will have no numbers of a breath.
+PetscErrorCode note_no_breath(MPI_Comm comm, const Scene &scene)
+{
+  PetscFunctionBeginUser;
+  if (!scene.facts().ventilator || scene.facts().ventilator->breathes()) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(PetscPrintf(comm,
+                        "pulmo: note: %s. The numbers of breaths will be null; the static curve has the end of each "
+                        "pause (a phase named 'pause', or of 'hold')\n",
+                        why_no_numbers(scene, {}).c_str()));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Says when the run first left the range of the model: below J = 1 - Phi0 the porosity is negative, and no tissue law
+/// but berger keeps J from it.
+PetscErrorCode warn_of_no_air(MPI_Comm comm, const Scene &scene, const Simulation &simulation)
+{
+  PetscFunctionBeginUser;
+  if (!scene.facts().airflow) PetscFunctionReturn(PETSC_SUCCESS);
+  const PetscReal least = 1 - scene.airflow().porosity();
+  for (const SignalRow &row : simulation.rows()) {
+    if (row.min_J >= least) continue;
+    PetscCall(
+        PetscPrintf(comm,
+                    "pulmo: warning: at t = %g s the porosity falls below zero: J = %g is less than 1 - Phi0 = %g "
+                    "(-airflow_porosity %g), so that there would be less than no air; from there on the numbers mean "
+                    "nothing. What to try: less suction, -tissue berger, a larger -airflow_porosity\n",
+                    (double)row.time, (double)row.min_J, (double)least, (double)scene.airflow().porosity()));
+    break;
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Says where the volume of a ventilated lung is no animal's: a shrew's has 0.05 ml, an elephant's a hundred litres.
+PetscErrorCode warn_of_size(MPI_Comm comm, const Scene &scene)
+{
+  constexpr PetscReal least = 0.02, largest = 2e5; // ml
+  const PetscReal volume = scene.mesh().volume() / units::mm3_per_ml;
+
+  PetscFunctionBeginUser;
+  if (scene.facts().ventilator && (volume < least || volume > largest))
+    PetscCall(
+        PetscPrintf(comm,
+                    "pulmo: warning: the lung has %.3g ml, %s than any animal's: coordinates times -mesh_scale "
+                    "have to be mm; give the -mesh_scale that makes them so (an adult's lung has 2000 to 6000 ml, a "
+                    "mouse's 0.2 ml)\n",
+                    (double)volume, volume < least ? "less" : "more"));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Elements of equal order are not stable where the tissue is undrained: in steps @p dt (s) in which pressure spreads
+/// by less than half a cell, k M dt < (h/2)^2. Says so, once.
+PetscErrorCode warn_of_equal_order(MPI_Comm comm, const Scene &scene, const Model &model, PetscReal dt, bool &warned)
+{
+  const SceneFacts &facts = scene.facts();
+  const Elements &elements = facts.elements;
+  const PetscReal half_edge = scene.mesh().edge() / 2;
+
+  PetscFunctionBeginUser;
+  if (warned || !facts.airflow || facts.pressure_damping || elements.displacement > elements.pressure)
+    PetscFunctionReturn(PETSC_SUCCESS);
+  warned = scene.airflow().permeability_at_rest() * model.modulus() * dt < half_edge * half_edge;
+  if (warned)
+    PetscCall(
+        PetscPrintf(comm,
+                    "pulmo: warning: in a step of %g s pressure spreads by less than half a cell, where "
+                    "-elements %s is not stable: look for a pressure that oscillates, or give -pressure_damping\n",
+                    (double)dt, elements.name()));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Tells of options that nothing used as soon as all had their turn: after the first step.
+class UnusedOptions final : public Observer {
+public:
+  UnusedOptions(Options &options, const Scene &scene) : options_(options), scene_(scene) {}
+  PetscErrorCode observe(const StepReport &step) override
+  {
+    PetscFunctionBeginUser;
+    if (!done_ && step.row.dt > 0) PetscCall(options_.warn_unused(scene_.facts().airflow, false));
+    done_ = step.row.dt > 0;
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+private:
+  Options &options_;
+  const Scene &scene_;
+  bool done_ = false;
+};
+
+/// Holds the energy that the steps of a run lost or made against the work that was given, which counts as what strains
+/// the lung by Balance::least at least.
+PetscErrorCode hold_energy(MPI_Comm comm, const EnergyAudit &energy, const Model &model, Simulation &simulation,
+                           bool &finished)
+{
+  const double least = Balance::least * Balance::least * model.modulus() * model.composition().mesh().volume() *
+                       units::j_per_kPa_mm3,
+               share = std::min<double>(energy.worst_share(), energy.worst_residual() / least);
+  std::ostringstream text;
+
+  PetscFunctionBeginUser;
+  text.precision(2);
+  text << energy.worst_residual() << " J without account, " << share << " of the work";
+  finished = share <= Balance::failure;
+  if (!finished)
+    PetscCall(simulation.end_unsolved("the run was not solved", text.str()));
+  else if (share > Balance::warning)
+    PetscCall(
+        PetscPrintf(comm, "pulmo: warning: the run is hardly solved: the solver leaves %s\n", text.str().c_str()));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace
+
+PetscErrorCode check_held(MPI_Comm comm, const Scene &scene, const Composition &composition)
+{
+  const std::vector<std::string> walls = composition.surfaces_of("lumen_pressure"),
+                                 bearing = composition.bearing_surfaces();
+
+  PetscFunctionBeginUser;
+  PetscCall(check_held(comm, composition, reference_modulus(scene.tissue().law())));
+  if (!walls.empty() && std::find(bearing.begin(), bearing.end(), "") == bearing.end())
+    PetscCall(check_wall_load(scene.mesh(), walls, bearing));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode initialize()
+{
+  PetscBool no_handler = PETSC_FALSE;
+
+  PetscFunctionBeginUser;
+  static ErrorHandler errors; // PETSc keeps a pointer to it to the end
+  PetscCall(errors.setup());
+  PetscCall(PetscOptionsGetBool(nullptr, nullptr, "-no_signal_handler", &no_handler, nullptr));
+  if (!no_handler) PetscCall(PetscPushSignalHandler(handle_signal, nullptr));
+  (void)std::signal(SIGXFSZ, SIG_IGN); // a file that may not grow any more: the write fails, and is told
+  PetscCall(register_fe_type());
+  PetscCall(register_metis_partitioner());
+  PetscCall(register_p_multigrid());
+  PetscCall(register_step_control());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+Run::Run(const Registry &registry) : options_(PETSC_COMM_WORLD), scene_(registry), simulation_(options_, scene_, model_)
+{}
+
+PetscErrorCode Run::declare()
+{
+  PetscFunctionBeginUser;
+  PetscCall(compat::settle_option_names(PETSC_COMM_WORLD));
+  PetscCall(scene_.declare(options_));
+  PetscCall(model_.declare(options_, scene_.facts().elements));
+  PetscCall(simulation_.declare(options_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Run::setup()
+{
+  PetscLogDouble start, end;
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscTime(&start));
+  PetscCall(options_.check_unknown());
+  PetscCall(options_.check_petsc());
+  PetscCall(scene_.prepare(options_));
+  Composition composition(scene_.mesh(), scene_.facts().elements);
+  PetscCall(scene_.compose(composition));
+  auto fields = std::make_shared<ParameterFields>();
+  PetscCall(fields->setup(options_, composition));
+  if (!fields->empty()) composition.vary(fields);
+  PetscCall(check_prescribed_once(composition));
+  PetscCall(pin_free_motions(composition));
+  PetscCall(model_.build(std::move(composition), reference_modulus(scene_.tissue().law())));
+  PetscCall(settle_under_loads(scene_, model_, settle_note_));
+  PetscCall(simulation_.setup());
+  PetscCall(PetscTime(&end));
+  simulation_.setup_took(end - start);
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+const char *version()
+{
+  return PULMO_VERSION;
+}
+
+PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &sources)
+{
+  const MPI_Comm comm = PETSC_COMM_WORLD;
+  Run run(registry);
+  Options &options = run.options();
+  const Scene &scene = run.scene();
+  Simulation &simulation = run.simulation();
+  Output output;
+  ErrorEstimate error_estimate(registry);
+  Checkpoint checkpoint(options, output, scene, run.model(), simulation);
+  bool view_effects = false, audit_energy = true, asked_to_stop = false;
+  PetscBool help, has_mesh;
+
+  PetscFunctionBeginUser;
+  finished = false;
+  options.came_from(sources);
+  PetscCall(run.declare());
+  PetscCall(output.declare(options));
+  PetscCall(checkpoint.declare(options));
+  PetscCall(error_estimate.declare(options));
+  options.group("effects", "ledger");
+  PetscCall(options.flag("view", "print effects, fields, terms, blocks and seconds at the end", view_effects));
+  options.group("energy", "energy balance");
+  PetscCall(
+      options.flag("audit", "follow the energy balance over the steps (energy.csv; backward Euler)", audit_energy));
+  PetscCall(PetscOptionsHasHelp(nullptr, &help));
+  PetscCall(PetscOptionsHasName(nullptr, nullptr, "-dm_plex_filename", &has_mesh));
+  if (help) PetscCall(options.print_help());
+  if (!help || has_mesh) PetscCall(run.setup()); // with -help PETSc lists what it reads for this scene
+  if (help) {
+    if (has_mesh) PetscCall(options.print_settled());
+    finished = true;
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+  PetscCall(check_held(comm, scene, run.model().composition()));
+  PetscCall(note_free_boundary(run.model().composition(), scene.facts().airflow));
+  PetscCall(warn_of_size(comm, scene));
+  if (!run.settle_note().empty()) PetscCall(PetscPrintf(comm, "pulmo: note: %s\n", run.settle_note().c_str()));
+  PetscCall(note_no_breath(comm, scene));
+  PetscCall(error_estimate.check(options, scene));
+  const Elements &elements = scene.facts().elements;
+  PulmoUserCheck(!output.error_indicator() || (elements.displacement == 2 && elements.pressure == 1), comm,
+                 "-output_fields_error_indicator recovers the stress of -elements P2-P1; leave one of the two out");
+
+  SignalWriter signals(comm, output, scene.facts());
+  ProgressPrinter progress(comm, scene.facts());
+  FieldWriter fields(output, scene, run.model());
+  Sampling sampling;
+  RegionAudit regions(scene, run.model(), sampling);
+  EnergyAudit energy(scene, run.model(), sampling);
+  if (simulation.scheme().multistep()) {
+    PetscBool given;
+    PetscCall(PetscOptionsHasName(nullptr, nullptr, "-energy_audit", &given));
+    PulmoUserCheck(!given || !audit_energy, comm,
+                   "-energy_audit: the balance is that of backward Euler; leave the option out with -ts_type bdf");
+    audit_energy = false;
+  }
+  Audits audits{regions, audit_energy ? &energy : nullptr};
+  PetscCall(sampling.setup(run.model()));
+  PetscCall(regions.setup());
+  simulation.add(regions);
+  if (audit_energy) {
+    PetscCall(energy.setup());
+    simulation.add(energy);
+  }
+  UnusedOptions unused(options, scene);
+  simulation.add(unused);
+  simulation.add(signals);
+  simulation.add(fields);
+  if (output.progress()) simulation.add(progress);
+  simulation.add(checkpoint);
+  bool warned_of_elements = false;
+  PetscCall(warn_of_equal_order(comm, scene, run.model(), simulation.wanted_dt(), warned_of_elements));
+  const bool restarts = !checkpoint.restart().empty();
+  if (restarts) PetscCall(checkpoint.restore());
+  PetscCall(error_estimate.check_sessions(options, checkpoint.numerics_changed()));
+  PetscCall(output.prepare(options, checkpoint.restart(), fields.files()));
+  if (restarts) PetscCall(fields.carry_over(checkpoint.restart_directory()));
+  {
+    StopSignal signal(comm);
+    simulation.heed(signal);
+    PetscCall(simulation.run(finished));
+    if (simulation.stopped()) PetscCall(stop(checkpoint, simulation, signal.name()));
+    PetscCall(signal.asked(asked_to_stop)); // in the last step
+  }
+  if (finished && audit_energy) PetscCall(hold_energy(comm, energy, run.model(), simulation, finished));
+  PetscCall(options.warn_unused(scene.facts().airflow, true));
+  PetscCall(warn_of_no_air(comm, scene, simulation));
+  PetscCall(simulation.pins().warn(run.model()));
+  for (const SignalRow &row : simulation.rows()) // steps that were cut
+    if (row.dt > 0) PetscCall(warn_of_equal_order(comm, scene, run.model(), row.dt, warned_of_elements));
+  if (view_effects) PetscCall(print_ledger(comm, scene, run.model(), simulation.seconds()));
+  if (audit_energy) PetscCall(write_energy(comm, output, simulation, energy));
+  if (!finished) {
+    std::string kept;
+    PetscCall(keep_last_state(checkpoint, simulation, kept));
+    PetscCall(fields.snapshot(simulation.time(), simulation.local_state()));
+    PetscCall(write_summary(options, output, scene, run.model(), simulation, audits, false));
+    PulmoFailure(comm, "%s The last good state and the signals so far are in %s.%s", simulation.failure_text().c_str(),
+                 output.directory().c_str(), kept.c_str());
+  }
+  PetscCall(signals.finish());
+  PetscCall(write_summary(options, output, scene, run.model(), simulation, audits, true));
+  PetscCall(print_numbers(comm, output, scene, simulation, audits));
+  const std::vector<SignalRow> rows = regions.complete(simulation.rows());
+  if (error_estimate.in_use() && (asked_to_stop || complete_breaths(rows).empty())) {
+    PetscCall(PetscPrintf(comm, "pulmo: warning: no error estimate: %s\n",
+                          asked_to_stop ? "the run was asked to stop" : why_no_numbers(scene, rows).c_str()));
+  } else if (error_estimate.in_use()) {
+    ErrorReport report;
+    PetscCall(error_estimate.make(options, output, scene, simulation, regions.numbers(simulation.rows()), report));
+    audits.errors = &report;
+    PetscCall(write_summary(options, output, scene, run.model(), simulation, audits, true));
+    PetscCall(print_error_bars(comm, report));
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace pulmo

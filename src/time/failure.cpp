@@ -1,0 +1,410 @@
+#include "pulmo/time/failure.hpp"
+
+#include "pulmo/base/units.hpp"
+#include "pulmo/fem/sampling.hpp"
+#include "pulmo/mesh/openings.hpp"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <sstream>
+
+namespace pulmo {
+
+namespace {
+
+/// At a limit point volume follows pressure more steeply than on the way there, by this factor at least: dV/dP goes to
+/// infinity, and steps end far closer to it than this asks for.
+constexpr double limit_steepness = 5;
+
+/// No cell that has less than this J is well.
+constexpr double well_formed = 0.5;
+
+/// Cells this many edges from the edge of the airway are at its rim.
+constexpr PetscReal rim_reach = 2;
+
+/// A stiffness below this share of that at rest is none: steps end just before it is gone.
+constexpr PetscReal no_stiffness = 0.01;
+/// Some laws have none at rest (CM5 against shear): only what is negative beyond rounding is lost.
+constexpr PetscReal rounding = 1e-8;
+
+/// More of the lung than this is no single place.
+constexpr PetscReal large_share = 0.1;
+
+/// Directions that are tried per quarter of a circle, and the search around the softest of them.
+constexpr int directions = 6, refinements = 30;
+
+using Direction = std::array<PetscReal, 3>;
+
+/// Least eigenvalue of a symmetric 3 x 3 matrix, by Jacobi rotations: the characteristic polynomial would lose half of
+/// the digits where two eigenvalues are the same.
+PetscReal least_eigenvalue(PetscReal S[3][3])
+{
+  constexpr int sweeps = 20;
+  for (int sweep = 0; sweep < sweeps; ++sweep)
+    for (int p = 0; p < 2; ++p)
+      for (int q = p + 1; q < 3; ++q) {
+        if (S[p][q] == 0) continue;
+        const int r = 3 - p - q;
+        const PetscReal theta = (S[q][q] - S[p][p]) / (2 * S[p][q]);
+        const PetscReal t = std::copysign(1 / (std::abs(theta) + std::hypot(theta, 1)), theta);
+        const PetscReal c = 1 / std::hypot(t, 1), s = t * c, of_p = S[r][p], of_q = S[r][q];
+        S[p][p] -= t * S[p][q];
+        S[q][q] += t * S[p][q];
+        S[p][q] = S[q][p] = 0;
+        S[r][p] = S[p][r] = c * of_p - s * of_q;
+        S[r][q] = S[q][r] = s * of_p + c * of_q;
+      }
+  return std::min({S[0][0], S[1][1], S[2][2]});
+}
+
+/// Of A_iJkL n_J n_L; @p A as TissueLaw::tangent has it, [i][k][J][L].
+PetscReal stiffness_along(const PetscScalar A[81], const Direction &n)
+{
+  PetscReal Q[3][3] = {};
+  for (int i = 0; i < 3; ++i)
+    for (int k = 0; k < 3; ++k)
+      for (int J = 0; J < 3; ++J)
+        for (int L = 0; L < 3; ++L) Q[i][k] += A[27 * i + 9 * k + 3 * J + L] * n[J] * n[L];
+  return least_eigenvalue(Q);
+}
+
+Direction direction(PetscReal polar, PetscReal azimuth)
+{
+  return {std::sin(polar) * std::cos(azimuth), std::sin(polar) * std::sin(azimuth), std::cos(polar)};
+}
+
+/// Distance of a point from a segment.
+PetscReal distance(const PetscReal x[3], const RimSegment &s)
+{
+  PetscReal along = 0, length = 0, square = 0;
+  for (int d = 0; d < 3; ++d) {
+    along += (x[d] - s[d]) * (s[3 + d] - s[d]);
+    length += (s[3 + d] - s[d]) * (s[3 + d] - s[d]);
+  }
+  const PetscReal t = length > 0 ? std::clamp<PetscReal>(along / length, 0, 1) : 0;
+  for (int d = 0; d < 3; ++d) {
+    const PetscReal away = x[d] - s[d] - t * (s[3 + d] - s[d]);
+    square += away * away;
+  }
+  return std::sqrt(square);
+}
+
+PetscReal length_of(const RimSegment &s)
+{
+  return std::hypot(s[3] - s[0], s[4] - s[1], s[5] - s[2]);
+}
+
+/// Distance of the cell from the edge of the airway and whether that is within two cells. Collective.
+PetscErrorCode look_at_rim(const Scene &scene, const Measures &cell, std::optional<PetscReal> &away, bool &near)
+{
+  const Mesh &mesh = scene.mesh();
+  const MPI_Comm comm = PetscObjectComm((PetscObject)mesh.dm());
+  PetscMPIInt rank;
+  PetscInt begin;
+  PetscReal edge = 0;
+  std::vector<std::string> names;
+  std::vector<RimSegment> rim;
+
+  PetscFunctionBeginUser;
+  near = false;
+  for (const std::string &name : scene.facts().airway_surfaces)
+    if (mesh.surfaces().count(name)) names.push_back(name);
+  PetscCall(find_rim(mesh, names, rim));
+  if (rim.empty()) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  if (rank == cell.rank && cell.cell >= 0) {
+    PetscReal volume;
+    PetscCall(DMPlexGetHeightStratum(mesh.dm(), 0, &begin, nullptr));
+    PetscCall(DMPlexComputeCellGeometryFVM(mesh.dm(), begin + cell.cell, &volume, nullptr, nullptr));
+    edge = 2 * std::cbrt(volume);
+  }
+  PetscCallMPI(MPI_Bcast(&edge, 1, MPIU_REAL, cell.rank, comm));
+  const auto nearest = std::min_element(rim.begin(), rim.end(), [&](const RimSegment &a, const RimSegment &b) {
+    return distance(cell.where, a) < distance(cell.where, b);
+  });
+  away = distance(cell.where, *nearest);
+  near = *away <= rim_reach * std::max(edge, length_of(*nearest));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Mean deformation gradient of each cell: share of the volume whose mean is not elliptic; and that of the whole lung.
+PetscErrorCode look_at_tissue(const Scene &scene, const Model &model, Vec local, Diagnosis &d)
+{
+  const TissueLaw &law = scene.tissue().law();
+  const MPI_Comm comm = PetscObjectComm((PetscObject)model.dm());
+  const PetscScalar zero[9] = {0};
+  PetscScalar mean[9];
+  PetscReal sums[12] = {0}; // Grad u, J - 1, lost volume, volume
+  PointState state;
+  Sampling sampling;
+  std::vector<Sample> samples;
+
+  PetscFunctionBeginUser;
+  make_point_state(zero, nullptr, state);
+  d.acoustic_at_rest = acoustic_stiffness(law, state).least;
+  const auto lost = [&](PetscReal stiffness, PetscReal at_rest) {
+    return stiffness < std::max<PetscReal>(no_stiffness * at_rest, 0) - rounding * model.modulus();
+  };
+  const bool varies = model.composition().varying() != nullptr;
+  const auto at_rest = [&](const PetscScalar *constants) { // in the state at hand, which is that
+    return varies ? acoustic_stiffness(law, state, true, constants).least : d.acoustic_at_rest;
+  };
+  PetscCall(sampling.setup(model));
+  {
+    const ReadArray x(local);
+    for (const Sampling::Element &cell : sampling.cells()) {
+      PetscScalar H[9] = {0};
+      const auto &weights = sampling.weights(cell);
+      sampling.sample(cell, x.data(), samples);
+      for (std::size_t q = 0; q < weights.size(); ++q) {
+        for (int i = 0; i < 9; ++i) H[i] += weights[q] * samples[q].state.H[i];
+        sums[9] += weights[q] * cell.measure * samples[q].state.J_minus_1;
+      }
+      for (int i = 0; i < 9; ++i) sums[i] += cell.measure * H[i];
+      const PetscScalar *constants = model.constants_at(cell.cell);
+      make_point_state(H, nullptr, state);
+      const PetscReal least = acoustic_stiffness(law, state, false, constants).least;
+      make_point_state(zero, nullptr, state);
+      if (lost(least, at_rest(constants))) sums[10] += cell.measure;
+      sums[11] += cell.measure;
+    }
+  }
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, sums, 12, MPIU_REAL, MPI_SUM, comm));
+  for (int i = 0; i < 9; ++i) mean[i] = sums[i] / sums[11];
+  d.mean_J = 1 + sums[9] / sums[11];
+  d.lost_share = sums[10] / sums[11];
+  make_point_state(mean, nullptr, state);
+  d.acoustic = acoustic_stiffness(law, state).least;
+  d.acoustic_lost = lost(d.acoustic, d.acoustic_at_rest);
+  d.inflation = inflation_stiffness(law, d.mean_J);
+  d.inflation_lost = lost(d.inflation, inflation_stiffness(law, 1));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Says so if the last rows, of a phase that prescribes pressure, end at a limit point; empty if not.
+std::string limit_point(const std::vector<SignalRow> &rows)
+{
+  std::ostringstream text;
+  std::size_t first = rows.size() - 1;
+  while (first > 0 && rows[first - 1].phase == rows.back().phase && rows[first - 1].breath == rows.back().breath)
+    --first;
+  if (first + 2 >= rows.size()) return "";
+  const SignalRow &begin = rows[first], &before = rows[rows.size() - 2], &end = rows.back();
+  const double last = (end.volume - before.volume) / (end.pressure - before.pressure),
+               way = (before.volume - begin.volume) / (before.pressure - begin.pressure);
+  if (!(end.pressure > before.pressure && before.pressure > begin.pressure && last > limit_steepness * way)) return "";
+  text.precision(4);
+  text << " Volume follows pressure ever more steeply, by " << last << " ml/cmH2O in the last step and " << way
+       << " on the way there: a limit point. There is no equilibrium above ";
+  text.precision(6);
+  text << end.pressure << " cmH2O.";
+  return text.str();
+}
+
+const FailedAttempt *last_inverted(const FailureFacts &facts)
+{
+  const auto found =
+      std::find_if(facts.attempts.rbegin(), facts.attempts.rend(), [](const auto &f) { return f.inverted; });
+  return found != facts.attempts.rend() ? &*found : nullptr;
+}
+
+/// Whether the last attempts all failed in the linear solver.
+bool linear_solver_failed(const FailureFacts &facts)
+{
+  return !facts.attempts.empty() && facts.attempts.back().reason.find("LINEAR") != std::string::npos;
+}
+
+/// What the diagnosis says, in a sentence that begins with a blank.
+std::string why(const Scene &scene, const FailureFacts &facts, const Diagnosis &d)
+{
+  std::ostringstream text;
+  text.precision(4);
+  const char *law = scene.tissue().law().name();
+  const auto stiffness = [&] {
+    text << "at the mean J = " << d.mean_J << " free inflation has dp/dJ = " << d.inflation / units::kPa_per_cmH2O
+         << " cmH2O, and the least stiffness against a plane wave (acoustic tensor, at the mean deformation) is "
+         << d.acoustic << " kPa, " << d.acoustic_at_rest << " at rest";
+    if (d.lost_share > 0) text << "; in " << 100 * d.lost_share << " % of the lung next to nothing of it is left";
+    text << ".";
+  };
+  switch (d.kind) {
+  case Diagnosis::Kind::rim:
+    text << " Where: at the airway's rim. That cell is " << *d.from_rim
+         << " mm from the edge of the airway, within two cells.";
+    break;
+  case Diagnosis::Kind::everywhere:
+    text << " Where: everywhere. The law " << law << " has no stiffness left at this stretch: ";
+    stiffness();
+    break;
+  case Diagnosis::Kind::inside:
+    text << " Where: inside the lung, in one place";
+    if (d.lost_share > 0) {
+      text << "; the law " << law << " loses its stiffness there: ";
+      stiffness();
+    } else {
+      text << ".";
+    }
+    break;
+  case Diagnosis::Kind::solver:
+    text << " Where: in the solver. "
+         << (linear_solver_failed(facts) ? "The linear solver failed" : "Newton's method stalled")
+         << " while no cell is near turning inside out (least J = " << facts.rows.back().min_J << ") and the law "
+         << law << " is elliptic: ";
+    stiffness();
+    break;
+  }
+  return text.str() + d.limit;
+}
+
+std::string what_to_try(const Scene &scene, const Diagnosis &d)
+{
+  bool wall = false; // the gas presses on it
+  for (const Effect *effect : scene.active()) wall = wall || effect->name() == std::string("lumen_pressure");
+  switch (d.kind) {
+  case Diagnosis::Kind::rim:
+    return std::string(wall ? "" : "-lumen_pressure (here it is off: nothing but springs bears the airway's wall), ") +
+           "a finer mesh there, a slower rise of pressure or flow, another -tissue.";
+  case Diagnosis::Kind::everywhere:
+    return "less pressure or volume, prescribed flow (-ventilator vcv), which goes on beyond a limit point of the "
+           "pressure, more that holds the lung (-chest_wall), another -tissue.";
+  case Diagnosis::Kind::inside:
+    return "a finer mesh there, a slower rise of pressure or flow, another -tissue.";
+  case Diagnosis::Kind::solver:
+    break;
+  }
+  return "another file of petsc_options/solvers, a smaller -ts_dt, a larger -snes_max_it, a slower rise of pressure or "
+         "flow, -snes_linesearch_type basic where volume is far stiffer than shape; -snes_monitor and -ksp_monitor "
+         "show where it stalls.";
+}
+
+} // namespace
+
+AcousticStiffness acoustic_stiffness(const TissueLaw &law, const PointState &state, bool refine,
+                                     const PetscScalar *constants)
+{
+  PetscScalar A[81];
+  AcousticStiffness found;
+  PetscReal polar = 0, azimuth = 0;
+
+  law.tangent(state, constants, A);
+  const auto look = [&](PetscReal at_polar, PetscReal at_azimuth) {
+    const Direction n = direction(at_polar, at_azimuth);
+    const PetscReal stiffness = stiffness_along(A, n);
+    if (!(stiffness < found.least)) return false;
+    found.least = stiffness;
+    std::copy(n.begin(), n.end(), found.direction);
+    polar = at_polar;
+    azimuth = at_azimuth;
+    return true;
+  };
+  PetscReal step = PETSC_PI / (2 * directions); // n and -n are the same: half a sphere
+  for (int i = 0; i <= directions; ++i)
+    for (int j = 0; j < (i == 0 ? 1 : 4 * directions); ++j) look(i * step, j * step);
+  for (int i = 0; refine && i < refinements; ++i) {
+    const PetscReal p = polar, a = azimuth;
+    bool better = false;
+    for (PetscReal dp : {-step, PetscReal(0), step})
+      for (PetscReal da : {-step, PetscReal(0), step}) better = look(p + dp, a + da) || better;
+    if (!better) step /= 2;
+  }
+  return found;
+}
+
+PetscReal inflation_stiffness(const TissueLaw &law, PetscReal J)
+{
+  const PetscReal stretch = std::cbrt(J);
+  PetscScalar H[9] = {0}, P[9], A[81];
+  PointState state;
+  for (int i = 0; i < 9; i += 4) H[i] = stretch - 1;
+  make_point_state(H, nullptr, state);
+  law.stress(state, P);
+  law.tangent(state, A);
+  PetscReal first = 0, second = 0; // derivatives of W by the stretch
+  for (int i = 0; i < 3; ++i) {
+    first += P[4 * i];
+    for (int k = 0; k < 3; ++k) second += A[27 * i + 9 * k + 3 * i + k];
+  }
+  // p = W'/(3 s^2), dJ = 3 s^2 ds
+  return (second - 2 * first / stretch) / (9 * std::pow(stretch, 4));
+}
+
+const char *Diagnosis::name() const
+{
+  switch (kind) {
+  case Kind::rim:
+    return "airway rim";
+  case Kind::everywhere:
+    return "everywhere";
+  case Kind::inside:
+    return "inside";
+  case Kind::solver:
+    break;
+  }
+  return "solver";
+}
+
+PetscErrorCode diagnose(const Scene &scene, const Model &model, const FailureFacts &facts, Vec local, Diagnosis &d)
+{
+  const FailedAttempt *inverted = last_inverted(facts);
+  Measures last;
+  bool at_rim = false;
+
+  PetscFunctionBeginUser;
+  d = Diagnosis();
+  PetscCall(look_at_tissue(scene, model, local, d));
+  PetscCall(model.measure(local, last));
+  const bool well = last.min_J > well_formed;
+  if (inverted)
+    d.worst = inverted->measures;
+  else if (!well)
+    d.worst = last;
+  if (d.worst) PetscCall(look_at_rim(scene, *d.worst, d.from_rim, at_rim));
+  // tissue that folds at a rim gives way, too; at a limit point all of it is well, and only attempts turn it inside out
+  if (well && facts.prescribes_pressure) d.limit = limit_point(facts.rows);
+  if (!d.limit.empty() || d.acoustic_lost)
+    d.kind = Diagnosis::Kind::everywhere;
+  else if (at_rim)
+    d.kind = Diagnosis::Kind::rim;
+  else if (d.lost_share > large_share || d.inflation_lost)
+    d.kind = Diagnosis::Kind::everywhere;
+  else if (d.worst)
+    d.kind = Diagnosis::Kind::inside;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+std::string failure_text(const Scene &scene, const FailureFacts &facts, const Diagnosis &d)
+{
+  const SignalRow &last = facts.rows.back();
+  const FailedAttempt *inverted = last_inverted(facts);
+  std::ostringstream text;
+
+  text.precision(6);
+  text << (facts.crawled ? "steps only crawl at t = " : "no step could be accepted after t = ") << last.time
+       << " s (phase " << facts.phase << ", airway pressure " << last.pressure << " cmH2O, volume " << last.volume
+       << " ml, tissue law " << scene.tissue().law().name() << ", J from " << last.min_J << " to " << last.max_J
+       << ").";
+  if (inverted)
+    text << " The tissue turned inside out: J = " << inverted->measures.min_J << " in the cell at ("
+         << inverted->measures.where[0] << ", " << inverted->measures.where[1] << ", " << inverted->measures.where[2]
+         << ") mm (cell " << inverted->measures.cell << " of rank " << inverted->measures.rank << ").";
+  text << " Tried";
+  for (const FailedAttempt &f : facts.attempts) {
+    text << (&f == &facts.attempts.front() ? " " : ", ") << "dt " << f.dt << " s (" << f.reason;
+    if (f.newton > 0) text << " after " << f.newton << " Newton steps" << (f.inverted ? ", J <= 0 on the way" : "");
+    text << ")";
+  }
+  text << "." << why(scene, facts, d);
+  std::string first;
+  if (facts.free_flow && scene.openings()) {
+    const std::string unequal = scene.openings()->unequal_shares();
+    if (!unequal.empty()) {
+      text << " -ventilator_flow_split uniform shares the flow by area: " << unequal << ".";
+      first = "-ventilator_flow_split common_pressure, ";
+    }
+  }
+  text << " What to try: " << first << what_to_try(scene, d);
+  return text.str();
+}
+
+} // namespace pulmo

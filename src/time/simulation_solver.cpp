@@ -1,0 +1,277 @@
+// The solvers of a simulation: TS, SNES and KSP as the options say, and what they call back.
+#include "pulmo/time/simulation.hpp"
+
+#include <petsc/private/tsimpl.h>
+
+namespace pulmo {
+
+namespace {
+
+PetscErrorCode ifunction(TS, PetscReal t, Vec X, Vec Xdot, Vec F, void *simulation)
+{
+  return static_cast<Simulation *>(simulation)->residual(t, X, Xdot, F);
+}
+
+PetscErrorCode ijacobian(TS, PetscReal t, Vec X, Vec Xdot, PetscReal, Mat A, Mat P, void *simulation)
+{
+  PetscFunctionBeginUser;
+  PetscCall(static_cast<Simulation *>(simulation)->jacobian(t, X, Xdot, P));
+  if (A != P) { // -snes_mf_operator
+    PetscCall(MatAssemblyBegin(A, MAT_FINAL_ASSEMBLY));
+    PetscCall(MatAssemblyEnd(A, MAT_FINAL_ASSEMBLY));
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode simulation_of(TS ts, Simulation **simulation)
+{
+  PetscFunctionBeginUser;
+  PetscCall(TSGetApplicationContext(ts, simulation));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode pre_stage(TS ts, PetscReal t)
+{
+  Simulation *simulation;
+
+  PetscFunctionBeginUser;
+  PetscCall(simulation_of(ts, &simulation));
+  PetscCall(simulation->before_stage(t));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode initial_guess(SNES snes, Vec X, void *simulation)
+{
+  return static_cast<Simulation *>(simulation)->guess(snes, X);
+}
+
+PetscErrorCode newton_step(SNESLineSearch search, Vec X, Vec Y, PetscBool *changed, void *simulation)
+{
+  SNES snes;
+
+  PetscFunctionBeginUser;
+  PetscCall(SNESLineSearchGetSNES(search, &snes));
+  PetscCall(static_cast<Simulation *>(simulation)->border(snes, X, Y));
+  *changed = PETSC_TRUE;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+constexpr const char *owner = "pulmo_simulation"; ///< of a matrix that is composed with it
+
+PetscErrorCode matrix_product(Mat A, Vec x, Vec y)
+{
+  PetscContainer container;
+  void *simulation;
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscObjectQuery((PetscObject)A, owner, (PetscObject *)&container));
+  PetscCheck(container, PetscObjectComm((PetscObject)A), PETSC_ERR_SUP, "a copy of a bordered Jacobian");
+  PetscCall(PetscContainerGetPointer(container, &simulation));
+  PetscCall(static_cast<Simulation *>(simulation)->product(x, y));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode newton_converged(SNES snes, PetscInt it, PetscReal xnorm, PetscReal ynorm, PetscReal fnorm,
+                                SNESConvergedReason *reason, void *simulation)
+{
+  return static_cast<Simulation *>(simulation)->converged(snes, it, xnorm, ynorm, fnorm, reason);
+}
+
+PetscErrorCode post_stage(TS ts, PetscReal, PetscInt, Vec *)
+{
+  Simulation *simulation;
+
+  PetscFunctionBeginUser;
+  PetscCall(simulation_of(ts, &simulation));
+  PetscCall(simulation->after_stage());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode post_step(TS ts)
+{
+  Simulation *simulation;
+
+  PetscFunctionBeginUser;
+  PetscCall(simulation_of(ts, &simulation));
+  PetscCall(simulation->after_step());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode check_stage(TSAdapt, TS ts, PetscReal t, Vec X, PetscBool *accept)
+{
+  Simulation *simulation;
+
+  PetscFunctionBeginUser;
+  PetscCall(simulation_of(ts, &simulation));
+  PetscCall(simulation->accept_stage(t, X, accept));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode choose_step(TSAdapt adapt, TS ts, PetscReal h, PetscInt *next_scheme, PetscReal *next_h,
+                           PetscBool *accept, PetscReal *wlte, PetscReal *wltea, PetscReal *wlter)
+{
+  Simulation *simulation;
+
+  PetscFunctionBeginUser;
+  PetscCall(simulation_of(ts, &simulation));
+  *next_scheme = 0;
+  *next_h = simulation->next_step(ts->ptime, h, adapt, *accept);
+  *wlte = *wltea = *wlter = -1; // PETSc is told no error
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode create_step_control(TSAdapt adapt)
+{
+  PetscFunctionBeginUser;
+  adapt->ops->choose = choose_step;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace
+
+PetscErrorCode register_step_control()
+{
+  PetscFunctionBeginUser;
+  PetscCall(TSAdaptRegister("pulmo", create_step_control));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Simulation::create_solver()
+{
+  const MPI_Comm comm = options_.comm();
+  SNES snes;
+  KSP ksp;
+  PC pc;
+  TSAdapt adapt;
+  PetscBool has_pc, is_fieldsplit = PETSC_FALSE, is_lu = PETSC_FALSE, is_cholesky = PETSC_FALSE;
+  char pc_type[64] = "";
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscOptionsGetString(nullptr, nullptr, "-pc_type", pc_type, sizeof(pc_type), &has_pc));
+  PulmoUserCheck(
+      has_pc, comm,
+      "no linear solver: give a solver file, e.g. -options_file petsc_options/solvers/direct.opts (or -pc_type)");
+  PetscCall(PetscStrcmp(pc_type, PCFIELDSPLIT, &is_fieldsplit));
+  PetscCall(PetscStrcmp(pc_type, PCLU, &is_lu));
+  PetscCall(PetscStrcmp(pc_type, PCCHOLESKY, &is_cholesky));
+  PulmoUserCheck(
+      !is_cholesky || !scene_.facts().airflow, comm,
+      "-pc_type cholesky needs a symmetric matrix, and that of a scene with airflow is not; use -pc_type lu");
+  if (!is_lu) PetscCall(attach_rigid_body_modes(model_.dm())); // a factorisation has no use for them
+
+  PetscCall(TSCreate(comm, ts_.out()));
+  PetscCall(TSSetDM(ts_, model_.dm()));
+  PetscCall(TSSetApplicationContext(ts_, this));
+  PetscCall(TSSetIFunction(ts_, nullptr, ifunction, this));
+  PetscCall(model_.create_matrix(matrix_.out()));
+  PetscCall(TSSetIJacobian(ts_, matrix_, matrix_, ijacobian, this));
+  PetscCall(TSSetProblemType(ts_, TS_NONLINEAR));
+  PetscCall(TSSetType(ts_, TSBEULER));
+  PetscCall(TSSetTimeStep(ts_, wanted_dt_));
+  PetscCall(TSSetMaxTime(ts_, PETSC_MAX_REAL));
+  PetscCall(TSSetMaxSteps(ts_, PETSC_MAX_INT));
+  PetscCall(TSSetExactFinalTime(ts_, TS_EXACTFINALTIME_MATCHSTEP));
+  PetscCall(TSSetMaxSNESFailures(ts_, -1));
+  PetscCall(TSSetMaxStepRejections(ts_, -1)); // reject() knows when to give up
+  PetscCall(TSSetErrorIfStepFails(ts_, PETSC_FALSE));
+  PetscCall(TSSetPreStage(ts_, pre_stage));
+  PetscCall(TSSetPostStage(ts_, post_stage));
+  PetscCall(TSSetPostStep(ts_, post_step));
+  PetscCall(TSGetAdapt(ts_, &adapt));
+  PetscCall(TSAdaptSetType(adapt, "pulmo"));
+  PetscCall(TSAdaptSetClip(adapt, 0.1, 2.0));
+  PetscCall(TSAdaptSetCheckStage(adapt, check_stage));
+  PetscCall(TSGetSNES(ts_, &snes));
+  PetscCall(SNESGetKSP(snes, &ksp));
+  if (is_fieldsplit && !scene_.facts().airflow) {
+    // one field: what a solver file says of the displacement split preconditions the whole
+    PetscCall(KSPGetPC(ksp, &pc));
+    PetscCall(PCSetOptionsPrefix(pc, "fieldsplit_displacement_"));
+  }
+  PetscCall(SNESSetComputeInitialGuess(snes, initial_guess, this));
+  PetscCall(compat::set_from_options(ts_));
+  PetscCall(offer_fixed_stress(ksp));
+  PetscCall(lagging_.setup(snes));
+  PetscBool tests_jacobian;
+  PetscCall(PetscOptionsHasName(nullptr, nullptr, "-snes_test_jacobian", &tests_jacobian));
+  tests_jacobian_ = tests_jacobian;
+  if (lagging_.in_use() || predictor_.in_use() ||
+      (scene_.facts().ventilator && scene_.facts().ventilator->prescribes_flow()))
+    PetscCall(SNESSetConvergenceTest(snes, newton_converged, this, nullptr));
+  if (scene_.facts().common_pressure()) {
+    SNESLineSearch search;
+    PetscBool newton;
+    SNESType type;
+    const SceneFacts &facts = scene_.facts();
+    const bool limits = facts.ventilator->limits_pressure(), split = facts.airflow && !facts.tube && !limits;
+    PetscCall(PetscObjectTypeCompare((PetscObject)snes, SNESNEWTONLS, &newton));
+    PetscCall(SNESGetType(snes, &type));
+    PulmoUserCheck(
+        newton, comm,
+        "option -snes_type %s does not go with %s: there the airway pressure is an unknown of its own, which "
+        "needs Newton with line search; use -snes_type newtonls%s",
+        type,
+        facts.tube ? "-tube"
+        : limits   ? "a limit of pressure"
+        : split    ? "-ventilator_flow_split common_pressure"
+                   : "a flow into a lung with -airflow off",
+        split ? ", or -ventilator_flow_split uniform" : "");
+    for (const char *option : {"-snes_mf", "-snes_mf_operator", "-snes_fd", "-snes_fd_color"}) {
+      PetscBool given = PETSC_FALSE;
+      PetscCall(PetscOptionsGetBool(nullptr, nullptr, option, &given, nullptr));
+      PulmoUserCheck(!given, comm,
+                     "%s: an airway pressure that is an unknown of its own needs the assembled Jacobian; "
+                     "leave the option out",
+                     option);
+    }
+    PetscCall(SNESGetLineSearch(snes, &search));
+    PetscCall(SNESLineSearchSetPreCheck(search, newton_step, this));
+    PetscContainer self; // the search for a smaller residual multiplies by the matrix to know the slope
+    PetscCall(PetscContainerCreate(comm, &self));
+    PetscCall(PetscContainerSetPointer(self, this));
+    PetscCall(PetscObjectCompose((PetscObject)(Mat)matrix_, owner, (PetscObject)self));
+    PetscCall(PetscContainerDestroy(&self));
+    PetscCall(MatGetOperation(matrix_, MATOP_MULT, &multiply_));
+    PetscCall(MatSetOperation(matrix_, MATOP_MULT, (void (*)())matrix_product));
+    PetscCall(VecDuplicate(state_, border_x_.out()));
+    PetscCall(VecDuplicate(state_, border_b_.out()));
+    PetscCall(VecDuplicate(state_, border_z_.out()));
+    PetscCall(VecDuplicate(state_, border_r_.out()));
+    PetscCall(VecDuplicate(local_, border_y_.out()));
+  }
+  PetscCall(TSGetTimeStep(ts_, &wanted_dt_));
+  PetscBool limits_steps;
+  PetscCall(PetscOptionsHasName(nullptr, nullptr, "-ts_adapt_dt_max", &limits_steps));
+  PulmoUserCheck(!limits_steps || step_control_.in_use(), comm,
+                 "-ts_adapt_dt_max: steps do not grow beyond -ts_dt unless their error chooses them; lower -ts_dt, or "
+                 "give -step_volume_tolerance and -step_pressure_tolerance");
+  PetscCall(scheme_.setup(ts_, local_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Gives `-pc_fieldsplit_schur_precondition user` its matrix.
+PetscErrorCode Simulation::offer_fixed_stress(KSP ksp)
+{
+  PC pc;
+  PetscBool fieldsplit;
+  PCFieldSplitSchurPreType type;
+  Mat none;
+
+  PetscFunctionBeginUser;
+  PetscCall(KSPGetPC(ksp, &pc));
+  PetscCall(PetscObjectTypeCompare((PetscObject)pc, PCFIELDSPLIT, &fieldsplit));
+  if (!fieldsplit || !scene_.facts().airflow) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscErrorCode (*has_schur)(void) = nullptr;
+  PetscCall(PetscObjectQueryFunction((PetscObject)pc, "PCFieldSplitGetSchurPre_C", &has_schur));
+  if (!has_schur) PetscFunctionReturn(PETSC_SUCCESS); // another -pc_fieldsplit_type
+  PetscCall(PCFieldSplitGetSchurPre(pc, &type, &none));
+  if (type != PC_FIELDSPLIT_SCHUR_PRE_USER) PetscFunctionReturn(PETSC_SUCCESS);
+  PulmoUserCheck(model_.own_integration(), options_.comm(),
+                 "-pc_fieldsplit_schur_precondition user needs pulmo's own integration; leave -petscfe_type out");
+  PetscCall(fixed_stress_.setup(model_.dm(), model_.assembly()));
+  model_.also_fill(fixed_stress_);
+  PetscCall(PCFieldSplitSetSchurPre(pc, type, fixed_stress_.matrix()));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace pulmo
