@@ -128,8 +128,8 @@ PetscErrorCode Options::check_petsc() const
       if (!ends_with(option, type.ending)) continue;
       PetscCall(PetscFunctionListFind(type.list, value.c_str(), &found));
       PulmoUserCheck(found, comm_,
-                     "option %s knows no '%s'; check its spelling (pulmo -help -dm_plex_filename MESH "
-                     "lists what this PETSc has)",
+                     "option %s knows no '%s' in this PETSc; check its spelling (pulmo -help -dm_plex_filename MESH "
+                     "lists what there is)",
                      option.c_str(), value.c_str());
     }
     if (ends_with(option, "pc_factor_mat_solver_type")) {

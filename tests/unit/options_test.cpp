@@ -295,19 +295,38 @@ TEST(SceneOptions, WhatPetscRenamedGoesByBothNames)
 {
   const std::string scene =
       "-dm_plex_filename " + source("meshes/cube_coarse.msh") + " -mesh_scale 1 -pc_type lu -support -support_rigid";
-  for (const char *name : {" -ts_dt", " -ts_time_step"}) {
+  const char *const later[] = {" -ts_time_step 0.0125", " -snes_linesearch_maxlambda 0.5",
+                               " -snes_linesearch_type secant"};
+  const char *const earlier[] = {" -ts_dt 0.0125", " -snes_linesearch_maxstep 0.5", " -snes_linesearch_type l2"};
+  for (const auto &names : {later, earlier}) {
     pulmo::Run run(Registry::standard());
-    PULMO_OK(prepare(run, scene + name + " 0.0125 -snes_linesearch_type secant"));
-    EXPECT_EQ(run.simulation().wanted_dt(), 0.0125) << name;
+    PULMO_OK(prepare(run, scene + names[0] + names[1] + names[2]));
+    EXPECT_EQ(run.simulation().wanted_dt(), 0.0125) << names[0];
     std::vector<std::pair<std::string, std::string>> list;
     PULMO_OK(run.options().all_given(list));
     std::map<std::string, std::string> given(list.begin(), list.end());
     EXPECT_EQ(given["-ts_dt"], "0.0125");
+    EXPECT_EQ(given["-snes_linesearch_maxstep"], "0.5");
     EXPECT_EQ(given["-snes_linesearch_type"], "l2");
+    // and this PETSc took them: its own names are those that petsc.hpp gives for it
+    SNES snes;
+    SNESLineSearch search;
+    SNESLineSearchType type;
+    PetscReal longest;
+    PULMO_OK(TSGetSNES(run.simulation().ts(), &snes));
+    PULMO_OK(SNESGetLineSearch(snes, &search));
+    PULMO_OK(SNESLineSearchGetType(search, &type));
+    PULMO_OK(SNESLineSearchGetTolerances(search, nullptr, &longest, nullptr, nullptr, nullptr, nullptr));
+    EXPECT_STREQ(type, compat::renamed_line_search.later_here ? "secant" : "l2");
+    EXPECT_EQ(longest, 0.5);
   }
   pulmo::Run run(Registry::standard());
   const std::string text = error_of([&] { return prepare(run, scene + " -ts_dt 0.1 -ts_time_step 0.2"); });
   EXPECT_HAS(text, "options -ts_dt and -ts_time_step are two names of the same");
+  for (const char *name : {"-ts_max_reject", "-ts_max_step_rejections"}) { // refused by the name that was given
+    pulmo::Run another(Registry::standard());
+    EXPECT_HAS(error_of([&] { return prepare(another, scene + " " + name + " 3"); }), std::string("option ") + name);
+  }
 }
 
 TEST(SceneOptions, TheListOfGivenOptionsKeepsBlanksAndDashes)

@@ -113,14 +113,14 @@ inline PetscErrorCode keep_operators(KSP ksp)
 #endif
 }
 
-/// An option, or the value of one, with another name in later releases.
+/// An option, or the value of one, with another name in later releases. Those that pulmo refuses
+/// (src/input/refused_options.cpp: -ts_max_reject) are refused there by either name.
 struct RenamedOption {
   const char *name, *later; ///< pulmo's files and docs say @p name
   bool later_here;          ///< this PETSc knows @p later only
 };
 inline constexpr RenamedOption renamed_options[] = {
     {"-ts_dt", "-ts_time_step", PETSC_VERSION_GE(3, 25, 0)},
-    {"-ts_max_reject", "-ts_max_step_rejections", PETSC_VERSION_GE(3, 25, 0)},
     {"-snes_linesearch_maxstep", "-snes_linesearch_maxlambda", PETSC_VERSION_GE(3, 24, 0)}};
 inline constexpr RenamedOption renamed_line_search = {"l2", "secant", PETSC_VERSION_GE(3, 24, 0)};
 
