@@ -474,66 +474,6 @@ PetscErrorCode Model::set_step(const Stage &stage, PetscReal airway_pressure, Pe
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Composition::check_parameters(MPI_Comm comm) const
-{
-  PetscFunctionBeginUser;
-  for (const Reader &reader : readers_) {
-    const auto n = std::count_if(parameters_.begin(), parameters_.end(), [&](const ParameterBlock &block) {
-      return constants::tag(block.owner) == constants::tag(reader.owner);
-    });
-    PetscCheck(n > 0, comm, PETSC_ERR_ARG_WRONGSTATE,
-               "effect %s: '%s' reads the parameters of '%s', which no effect hands over; call "
-               "Composition::parameters in terms()",
-               reader.effect.c_str(), reader.term.c_str(), reader.owner);
-    PetscCheck(n == 1, comm, PETSC_ERR_ARG_WRONGSTATE,
-               "effect %s: the parameters of '%s' are handed over %d times; give each block an owner of its own",
-               reader.effect.c_str(), reader.owner, (int)n);
-  }
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscInt Composition::constant_at(const PetscReal *parameter, const char **owner) const
-{
-  PetscInt offset = 1 + 2 * static_cast<PetscInt>(parameters_.size() + 1) +
-                    static_cast<PetscInt>(sizeof(Step) / sizeof(PetscScalar)); // as constants() lists them
-  for (const ParameterBlock &block : parameters_) {
-    if (!std::less<>()(parameter, block.data) && std::less<>()(parameter, block.data + block.count)) {
-      *owner = block.owner;
-      return offset + static_cast<PetscInt>(parameter - block.data);
-    }
-    offset += block.count;
-  }
-  return -1;
-}
-
-std::vector<std::string> Composition::surfaces_that_read(const char *owner) const
-{
-  std::vector<std::string> list;
-  for (const Reader &reader : readers_)
-    if (!reader.surface.empty() && constants::tag(reader.owner) == constants::tag(owner))
-      list.push_back(reader.surface);
-  return list;
-}
-
-std::vector<PetscScalar> Composition::constants(const Step &step) const
-{
-  std::vector<ParameterBlock> blocks = parameters_;
-
-  // the step is asked for by every kernel: first in the directory
-  blocks.insert(blocks.begin(),
-                {Step::owner, reinterpret_cast<const PetscScalar *>(&step), sizeof(Step) / sizeof(PetscScalar)});
-  const auto n = static_cast<PetscInt>(blocks.size());
-  std::vector<PetscScalar> all(1, static_cast<PetscScalar>(n));
-  PetscInt offset = 1 + 2 * n;
-  for (const ParameterBlock &block : blocks) {
-    all.push_back(constants::tag(block.owner));
-    all.push_back(static_cast<PetscScalar>(offset));
-    offset += block.count;
-  }
-  for (const ParameterBlock &block : blocks) all.insert(all.end(), block.data, block.data + block.count);
-  return all;
-}
-
 PetscErrorCode Model::pack_constants()
 {
   PetscDS ds;

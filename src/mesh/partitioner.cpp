@@ -1,3 +1,4 @@
+// METIS as a partitioner of PETSc's.
 #include "pulmo/mesh/mesh.hpp"
 
 #include <petsc/private/partitionerimpl.h>

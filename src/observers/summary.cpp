@@ -1,3 +1,4 @@
+// summary.json and energy.csv.
 #include "pulmo/base/units.hpp"
 #include "pulmo/fem/free_boundary.hpp"
 #include "pulmo/observers/output.hpp"

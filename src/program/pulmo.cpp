@@ -1,3 +1,4 @@
+// The program as a library: initialisation, a scene made ready (Run), a whole run with its files (run()).
 #include "pulmo/pulmo.hpp"
 
 #include "pulmo/base/units.hpp"
