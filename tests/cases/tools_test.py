@@ -16,6 +16,7 @@ import unittest
 
 import numpy as np
 
+import case_meshes
 import pulmo_case as pulmo
 
 sys.path.insert(0, os.path.join(pulmo.SOURCE, "tools"))
@@ -368,6 +369,23 @@ class Tools(unittest.TestCase):
         with open(os.path.join(folder, "solve.png"), "rb") as f:
             self.assertEqual(f.read(8), b"\x89PNG\r\n\x1a\n")
         self.assertEqual(benchmark(*few).stdout.count("kept"), 4)
+
+    def test_benchmark_tells_which_breaths_finish(self):
+        """A row per breath, law and flags with the run's own numbers; what stopped is run again as --checks says."""
+        folder, mesh = pulmo.scratch(), case_meshes.scaled("cube_lung.msh", 10)[1]
+        hasty = "@direct -snes_max_it 1 -snes_rtol 1e-14 -ts_adapt_dt_min 0.01"
+        made = benchmark("breaths", "--mesh", mesh, "--laws", "yoshihara", "--breaths", "VCV 250 ml, PEEP 5", "--volume", "100",
+                         "--checks", "direct", "--output", folder, "--", "@reuse", hasty)
+        self.assertEqual(made.returncode, 0, made.stdout + made.stderr)
+        self.assertIn("1 of 2 finished", made.stdout)
+        whole, stopped = table(os.path.join(folder, "breaths.csv"))
+        self.assertEqual((whole["law"], whole["flags"], whole["end"]), ("yoshihara", "@reuse", "0: finished"))
+        self.assertEqual((whole["V_T ml"], whole["cut"]), ("100", "0"))
+        self.assertGreater(float(whole["C_rs ml/cmH2O"]), 0)
+        self.assertEqual(stopped["V_T ml"], "-")
+        self.assertRegex(stopped["end"], r"^2: t = [0-9.]+ s, settle, [0-9.]+ cmH2O: in the solver$")
+        with open(os.path.join(folder, "breaths.md")) as f:
+            self.assertRegex(f.read(), r"run again:\n\n.*\n.*\n\| VCV 250 ml, PEEP 5 \| yoshihara \| @direct \| 0: finished \| 100 \|")
 
     def test_benchmark_refuses(self):
         few = ["strategies", "pcv", "--mesh", pulmo.mesh("cube_lung.msh"), "--output", pulmo.scratch()]
