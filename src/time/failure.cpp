@@ -19,6 +19,8 @@ constexpr double limit_steepness = 5;
 
 /// No cell that has less than this J is well.
 constexpr double well_formed = 0.5;
+/// Steps end just before a cell folds: with more than this J left it is not what stopped them.
+constexpr double folded = 0.05;
 
 /// Cells this many edges from the edge of the airway are at its rim.
 constexpr PetscReal rim_reach = 2;
@@ -249,8 +251,8 @@ std::string why(const Scene &scene, const FailureFacts &facts, const Diagnosis &
   case Diagnosis::Kind::solver:
     text << " Where: in the solver. "
          << (linear_solver_failed(facts) ? "The linear solver failed" : "Newton's method stalled")
-         << " while no cell is near turning inside out (least J = " << facts.rows.back().min_J << ") and the law "
-         << law << " is elliptic: ";
+         << " while no cell of the last step is near turning inside out (least J = " << facts.rows.back().min_J
+         << ") and the law " << law << " is elliptic" << (d.lost_share > 0 ? " in the mean: " : ": ");
     stiffness();
     break;
   }
@@ -264,17 +266,17 @@ std::string what_to_try(const Scene &scene, const Diagnosis &d)
   switch (d.kind) {
   case Diagnosis::Kind::rim:
     return std::string(wall ? "" : "-lumen_pressure (here it is off: nothing but springs bears the airway's wall), ") +
-           "a finer mesh there, a slower rise of pressure or flow, another -tissue.";
+           "a finer mesh there, a slower rise or fall of pressure or flow, another -tissue.";
   case Diagnosis::Kind::everywhere:
     return "less pressure or volume, prescribed flow (-ventilator vcv), which goes on beyond a limit point of the "
            "pressure, more that holds the lung (-chest_wall), another -tissue.";
   case Diagnosis::Kind::inside:
-    return "a finer mesh there, a slower rise of pressure or flow, another -tissue.";
+    return "a finer mesh there, a slower rise or fall of pressure or flow, another -tissue.";
   case Diagnosis::Kind::solver:
     break;
   }
-  return "another file of petsc_options/solvers, a smaller -ts_dt, a larger -snes_max_it, a slower rise of pressure or "
-         "flow, -snes_linesearch_type basic where volume is far stiffer than shape; -snes_monitor and -ksp_monitor "
+  return "another file of petsc_options/solvers, a smaller -ts_dt, a larger -snes_max_it, a slower rise or fall of "
+         "pressure or flow, -snes_linesearch_type basic where volume is far stiffer than shape; -snes_monitor and -ksp_monitor "
          "show where it stalls.";
 }
 
@@ -364,6 +366,8 @@ PetscErrorCode diagnose(const Scene &scene, const Model &model, const FailureFac
   if (well && facts.prescribes_pressure) d.limit = limit_point(facts.rows);
   if (!d.limit.empty() || d.acoustic_lost)
     d.kind = Diagnosis::Kind::everywhere;
+  else if (linear_solver_failed(facts) && !facts.attempts.back().inverted && last.min_J > folded)
+    d.kind = Diagnosis::Kind::solver; // longer steps turned tissue inside out; the shortest ones, that count, did not
   else if (at_rim)
     d.kind = Diagnosis::Kind::rim;
   else if (d.lost_share > large_share || d.inflation_lost)
