@@ -276,7 +276,8 @@ std::string what_to_try(const Scene &scene, const Diagnosis &d)
     break;
   }
   return "another file of petsc_options/solvers, a smaller -ts_dt, a larger -snes_max_it, a slower rise or fall of "
-         "pressure or flow, -snes_linesearch_type basic where volume is far stiffer than shape; -snes_monitor and -ksp_monitor "
+         "pressure or flow, -snes_linesearch_type basic where volume is far stiffer than shape; -snes_monitor and "
+         "-ksp_monitor "
          "show where it stalls.";
 }
 
