@@ -289,7 +289,8 @@ class Programmes(unittest.TestCase):
 
     def test_the_error_estimate_scales_them(self):
         text = "inspiration 0.4 pressure 5 ramp 0.1 dt 0.02\nexpiration 0.8 pressure 0 ramp 0.1 dt 0.02\n"
-        case = pulmo.finished(CUBE + pulmo.programme(text) + ["-ts_dt", "0.5", "-error_estimate"])
+        case = pulmo.finished(CUBE + pulmo.programme(text) + ["-ts_dt", "0.5", "-error_estimate", "-error_estimate_mesh",
+                                                                case_meshes.coarse_cube_lung()])
         runs = case.json()["error_estimate"]["runs"]
         self.assertEqual([run["steps"] for run in runs[:1] + runs[2:]], [60, 32, 17, 17])  # steps that end with ramp and phase
         self.assertIsNotNone(case.json()["error_estimate"]["numbers"]["tidal_volume_ml"]["time"])

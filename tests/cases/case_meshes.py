@@ -81,3 +81,10 @@ def bodies(*names):
         copies += [(kind, cells + sum(map(len, points)), [mine[t] for t in physical]) for kind, cells, physical in blocks]
         points.append(cube * (5 if name == "stiff" else 4) + ([0, 0, 0] if name == "stiff" else [100, 0, 0]))
     return save(np.concatenate(points), copies, {name: (tags[name], 3 if name == "lung" else 2) for name in ("airway", "lung") + names})
+
+
+def coarse_cube_lung():
+    """Path of meshes/cube_lung.msh in six tetrahedra: another mesh for error bars, where only the steps are looked at."""
+    points, cells = kuhn((1, 1, 1), (10, 10, 10))
+    facets = boundary(cells)
+    return write(points, cells, facets, ["airway" if face == "x1" else "pleura" for face in faces_of_box(points, facets, (10, 10, 10))])[1]

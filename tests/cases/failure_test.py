@@ -1,5 +1,6 @@
 #!/usr/bin/python3
-"""A run that could not go on says where: at the airway's rim, everywhere, or in the solver; the same on any number of ranks."""
+"""A run that could not go on says where: everywhere, or in the solver; the same on any number of ranks. At the airway's rim:
+stability_test, which makes those runs."""
 import unittest
 
 import defaults_test
@@ -10,27 +11,30 @@ WORDS = {"airway rim": "Where: at the airway's rim.", "everywhere": "Where: ever
 FREE = pulmo.DIRECT + pulmo.BLOCK + pulmo.QUIET + pulmo.STILL
 
 
+def expect_where(test, case, where, *words):
+    """That a run could not go on, and says where and these words; its diagnosis."""
+    test.assertEqual(case.code, 2, case.tail())
+    found = case.json("failure.json")["diagnosis"]
+    test.assertEqual(found["where"], where, case.err)
+    for name, text in WORDS.items():
+        test.assertEqual(text in case.err, name == where, case.err)
+    for word in words:
+        test.assertIn(word, case.err)
+    return found
+
+
+def expect_rim(test, case, cell):
+    """CM1 swells into its airway where only springs bear the wall; cell: size of the cells there, mm. The runs are those of
+    stability_test."""
+    found = expect_where(test, case, "airway rim", "What to try: -lumen_pressure (here it is off")
+    test.assertLess(found["distance_from_rim_mm"], 2 * 2 * cell)
+    test.assertIn(f"That cell is {found['distance_from_rim_mm']:.4g} mm from the edge of the airway", case.err)
+
+
 class Failure(unittest.TestCase):
     def expect(self, where, options, *words, ranks=1):
         case = pulmo.Case(options, ranks=ranks)
-        self.assertEqual(case.code, 2, case.tail())
-        failure = case.json("failure.json")
-        self.assertEqual(failure["diagnosis"]["where"], where, case.err)
-        for name, text in WORDS.items():
-            self.assertEqual(text in case.err, name == where, case.err)
-        for word in words:
-            self.assertIn(word, case.err)
-        return case, failure["diagnosis"]
-
-    def test_rim(self):
-        """CM1 swells into its airway where only springs bear the wall."""
-        cm1 = pulmo.DIRECT + pulmo.PCV + pulmo.QUIET + ["-tissue", "berger", "-ts_max_time", "0.3"]
-        cube = cm1 + pulmo.CUBE + ["-ventilator_pip", "40", "-airflow_permeability", "10"]
-        lung = cm1 + pulmo.LUNG + ["-ventilator_pip", "20", "-ts_adapt_dt_min", "1e-3"]
-        for scene, cell, ranks in (cube, 2.2, 1), (cube, 2.2, 2), (lung, 10, 1):  # mm
-            case, found = self.expect("airway rim", scene, "What to try: -lumen_pressure (here it is off", ranks=ranks)
-            self.assertLess(found["distance_from_rim_mm"], 2 * 2 * cell)
-            self.assertIn(f"That cell is {found['distance_from_rim_mm']:.4g} mm from the edge of the airway", case.err)
+        return case, expect_where(self, case, where, *words)
 
     def test_limit_point(self):
         """CM4 without springs has no equilibrium above 16.83 cmH2O: dp/dJ vanishes at J = 2.534, and it stays elliptic."""

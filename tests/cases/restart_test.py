@@ -294,11 +294,8 @@ class ErrorBars(RestartCase):
         self.refused(middle, [], "-ts_dt was '0.05' until t = 0.2 s and '0.025' after it")
         # what changes no number may change
         free = ["-ts_max_time", "0.6", "-snes_monitor", "-output_fields_every", "0.3", "-snes_rtol", "1.0e-14", "-mesh_scale", "1.0"]
-        points, cells = case_meshes.kuhn((1, 1, 1), (10, 10, 10)) # cheaper than the mesh refined once, which the bars in space take else
-        facets = case_meshes.boundary(cells)
-        coarse = case_meshes.write(points, cells, facets, ["airway" if face == "x1" else "pleura" for face in
-                                                           case_meshes.faces_of_box(points, facets, (10, 10, 10))])
-        made = pulmo.finished(PCV + free + ["-error_estimate", "-error_estimate_mesh", coarse[1], "-restart", start.path("checkpoint.h5")])
+        coarse = ["-error_estimate_mesh", case_meshes.coarse_cube_lung()]
+        made = pulmo.finished(PCV + free + coarse + ["-error_estimate", "-restart", start.path("checkpoint.h5")])
         self.assertIsNotNone(made.json()["error_estimate"]["numbers"]["tidal_volume_ml"]["time"])
 
 

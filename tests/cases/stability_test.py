@@ -9,6 +9,7 @@ import unittest
 
 import numpy as np
 
+import failure_test
 import pulmo_case as pulmo
 
 sys.path.insert(0, os.path.join(pulmo.SOURCE, "tools"))
@@ -54,12 +55,14 @@ class Stability(unittest.TestCase):
                                                          "-ts_max_time", "0.3"], ranks=ranks)
                 self.expect_stopped(case, "converged to a state with J <= 0", "The tissue turned inside out: J = -",
                                     "-lumen_pressure", "berger")
+                failure_test.expect_rim(self, case, 2.2)
                 self.assertLess(case.signals("signals.csv.part")["time_s"][-1], 0.1)
 
     def test_berger_on_the_lung_at_high_pressure(self):
         case = pulmo.Case(BERGER + pulmo.LUNG + ["-ventilator_pip", "20", "-ts_adapt_dt_min", "1e-3",
                                                  "-ts_max_time", "0.3"])
         self.expect_stopped(case, "The tissue turned inside out: J = -")
+        failure_test.expect_rim(self, case, 10)
 
     def test_steps_are_cut_and_grow_back(self):
         """The whole pressure in the first step is too much for the default step; later the step asked for returns.
