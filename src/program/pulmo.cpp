@@ -252,6 +252,7 @@ PetscErrorCode Run::setup()
   PetscCall(check_prescribed_once(composition));
   PetscCall(pin_free_motions(composition));
   PetscCall(model_.build(std::move(composition), reference_modulus(scene_.tissue().law())));
+  PetscCall(check_stable_at_rest(options_, scene_, model_)); // before any load is looked at
   PetscCall(settle_under_loads(scene_, model_, settle_note_));
   PetscCall(simulation_.setup());
   PetscCall(PetscTime(&end));

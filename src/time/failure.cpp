@@ -314,15 +314,15 @@ AcousticStiffness acoustic_stiffness(const TissueLaw &law, const PointState &sta
   return found;
 }
 
-PetscReal inflation_stiffness(const TissueLaw &law, PetscReal J)
+PetscReal inflation_stiffness(const TissueLaw &law, PetscReal J, const PetscScalar *constants)
 {
   const PetscReal stretch = std::cbrt(J);
   PetscScalar H[9] = {0}, P[9], A[81];
   PointState state;
   for (int i = 0; i < 9; i += 4) H[i] = stretch - 1;
   make_point_state(H, nullptr, state);
-  law.stress(state, P);
-  law.tangent(state, A);
+  law.stress(state, constants, P);
+  law.tangent(state, constants, A);
   PetscReal first = 0, second = 0; // derivatives of W by the stretch
   for (int i = 0; i < 3; ++i) {
     first += P[4 * i];
@@ -330,6 +330,68 @@ PetscReal inflation_stiffness(const TissueLaw &law, PetscReal J)
   }
   // p = W'/(3 s^2), dJ = 3 s^2 ds
   return (second - 2 * first / stretch) / (9 * std::pow(stretch, 4));
+}
+
+std::string unstable_at_rest(const TissueLaw &law, const PetscScalar *constants)
+{
+  const PetscScalar zero[9] = {0};
+  PetscScalar A[81];
+  PointState state;
+  std::ostringstream text;
+
+  make_point_state(zero, nullptr, state);
+  law.tangent(state, constants, A);
+  PetscReal size = 0;
+  for (const PetscScalar a : A) size = std::max(size, std::abs(a));
+  // laws are functions of invariants: at rest all directions are alike
+  const PetscReal inflation = inflation_stiffness(law, 1, constants), wave = stiffness_along(A, {1, 0, 0});
+  text.precision(3);
+  if (!(inflation > rounding * size))
+    text << "free inflation has dp/dJ = " << inflation << " kPa, so that it shrinks where gas presses from inside";
+  if (!(wave >= -rounding * size))
+    text << (text.str().empty() ? "" : "; ") << "the least stiffness against a plane wave is " << wave
+         << " kPa, so that it shears by itself";
+  return text.str();
+}
+
+PetscErrorCode check_stable_at_rest(const Options &options, const Scene &scene, const Model &model)
+{
+  const TissueLaw &law = scene.tissue().law();
+  const bool varies = model.composition().varying() != nullptr;
+  PetscInt begin, end;
+  PetscReal found[4] = {0}; // whether a cell is unstable; where
+  std::string why, given;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMPlexGetHeightStratum(model.dm(), 0, &begin, &end));
+  for (PetscInt c = 0; c < (varies ? end - begin : std::min<PetscInt>(1, end - begin)) && why.empty(); ++c) {
+    PetscReal volume;
+    why = unstable_at_rest(law, model.constants_at(c));
+    if (why.empty()) continue;
+    found[0] = 1;
+    PetscCall(DMPlexComputeCellGeometryFVM(model.dm(), begin + c, &volume, found + 1, nullptr));
+  }
+  // the first rank that found one tells
+  const MPI_Comm comm = options.comm();
+  PetscMPIInt rank, size, teller;
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  PetscCallMPI(MPI_Comm_size(comm, &size));
+  teller = found[0] > 0 ? rank : size;
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &teller, 1, MPI_INT, MPI_MIN, comm));
+  if (teller == size) PetscFunctionReturn(PETSC_SUCCESS);
+  int length = static_cast<int>(why.size());
+  PetscCallMPI(MPI_Bcast(&length, 1, MPI_INT, teller, comm));
+  why.resize(static_cast<std::size_t>(length));
+  PetscCallMPI(MPI_Bcast(why.data(), length, MPI_CHAR, teller, comm));
+  PetscCallMPI(MPI_Bcast(found, 4, MPIU_REAL, teller, comm));
+  for (const auto &[name, value] : options.own_used()) // those of other laws are not in use
+    if (name.rfind("-tissue_", 0) == 0) given += (given.empty() ? "" : ", ") + name + " " + value;
+  std::ostringstream where;
+  if (varies) where << " at (" << found[1] << ", " << found[2] << ", " << found[3] << ") mm";
+  PulmoUserError(comm,
+                 "-tissue %s%s is not stable at rest: %s; change its parameters (%s; -help has the published ones), or "
+                 "take another law",
+                 law.name(), where.str().c_str(), why.c_str(), given.c_str());
 }
 
 const char *Diagnosis::name() const

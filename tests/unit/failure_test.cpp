@@ -127,5 +127,43 @@ TEST(InflationStiffness, IsTheSlopeOfThePressure)
     }
 }
 
+/// Parameters of a law, to be changed.
+PetscScalar *parameters(const TissueLaw &l)
+{
+  PetscInt n;
+  return const_cast<PetscScalar *>(l.parameters(&n));
+}
+
+TEST(Rest, PublishedParametersAreStable)
+{
+  for (const auto &l : Registry::standard().make_tissue_laws()) EXPECT_EQ(unstable_at_rest(*l), "") << l->name();
+}
+
+TEST(Rest, AStressOfItsOwnIsAllowed)
+{
+  const auto berger = law("berger");
+  parameters(*berger)[2] = 0.7; // phi0: dW/dJ = m (1 - 1/phi0) = -0.21 kPa at rest
+  PetscScalar P[9];
+  berger->stress(state_of_F(identity), P);
+  EXPECT_LT(P[0], -0.2);
+  EXPECT_EQ(unstable_at_rest(*berger), "");
+}
+
+TEST(Rest, Cm2IsStableAsFarAsItsModuliSay)
+{
+  // to second order W = c [1 + a tr(e)^2 + b (tr(e)^2 - e : e)/2]: bulk modulus 2 c (a + b/3), shear modulus -b c/2
+  const auto ma = law("ma");
+  PetscScalar *k = parameters(*ma);
+  for (double a : {-0.1, 0.0, 0.043, 0.15, 0.25, 0.43})
+    for (double b : {-0.6, -0.2, 0.1}) {
+      k[0] = a;
+      k[1] = b;
+      EXPECT_NEAR(inflation_stiffness(*ma, 1), 2 * 2 * (a + b / 3), 1e-12) << a << " " << b;
+      const std::string why = unstable_at_rest(*ma);
+      EXPECT_EQ(why.find("dp/dJ") != std::string::npos, a + b / 3 <= 0) << a << " " << b << ": " << why;
+      EXPECT_EQ(why.find("plane wave") != std::string::npos, b > 0 || a < 0) << a << " " << b << ": " << why;
+    }
+}
+
 } // namespace
 } // namespace pulmo::test

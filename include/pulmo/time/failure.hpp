@@ -34,8 +34,15 @@ AcousticStiffness acoustic_stiffness(const TissueLaw &law, const PointState &sta
                                      const PetscScalar *constants = nullptr);
 
 /// dp/dJ of tissue that inflates freely, F = J^(1/3) I and p = dW/dJ, kPa: at zero or below nothing but what holds the
-/// lung from outside keeps it from going on by itself.
-PetscReal inflation_stiffness(const TissueLaw &law, PetscReal J);
+/// lung from outside keeps it from going on by itself. @p constants: as in TissueLaw::stress.
+PetscReal inflation_stiffness(const TissueLaw &law, PetscReal J, const PetscScalar *constants = nullptr);
+
+/// Why tissue with these parameters is not stable at rest; empty if it is. Free inflation must take pressure, and no
+/// plane wave may grow by itself. A law's own stress at rest counts in both; no stiffness against shear at all (CM5)
+/// is allowed.
+std::string unstable_at_rest(const TissueLaw &law, const PetscScalar *constants = nullptr);
+/// Refuses a model with cells whose tissue is not stable at rest; the message names the law's options. Collective.
+PetscErrorCode check_stable_at_rest(const Options &options, const Scene &scene, const Model &model);
 
 /// What is known of the end of a run.
 struct FailureFacts {
