@@ -274,6 +274,29 @@ PetscErrorCode Archive::local(const std::string &name, Vec x)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode Archive::cells(const std::string &name, std::size_t width, std::vector<double> &values)
+{
+  std::vector<double> all;
+  bool good = true;
+
+  PetscFunctionBeginUser;
+  if (!cell_order_.ready()) PetscCall(cell_order_.setup(model_.dm()));
+  if (!reading_) {
+    PetscCall(cell_order_.gather(width, values, all));
+    if (root_) good_ = good_ && write_dataset(file_, name, H5T_NATIVE_DOUBLE, {all.size() / width, width}, all.data());
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+  if (root_) {
+    const QuietHdf5 quiet;
+    std::vector<hsize_t> shape;
+    good = read_dataset(file_, name, H5T_NATIVE_DOUBLE, shape, all) && shape.size() == 2 && shape[1] == width;
+  }
+  PetscCall(check_root(good, name));
+  PetscCall(cell_order_.scatter(width, all, values, good));
+  PetscCall(check(good, name));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode Archive::global(const std::string &name, Vec X)
 {
   const DM dm = model_.dm();

@@ -1,6 +1,7 @@
 #include "pulmo/fem/assembly.hpp"
 
 #include "pulmo/base/simd.hpp"
+#include "pulmo/fem/point_memory.hpp"
 #include "pulmo/physics/parameter_fields.hpp"
 
 #include <algorithm>
@@ -58,17 +59,26 @@ PetscErrorCode Assembly::setup(DM dm, PetscDS rate_ds, const ParameterFields *va
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode Assembly::remember(const PointMemory &memory)
+{
+  PetscFunctionBeginUser;
+  memory_ = &memory;
+  places_.memory_width = memory.width();
+  PetscCall(PlaceData::attach(ds_, &places_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode Assembly::setup_varying(const ParameterFields &fields)
 {
   PetscFunctionBeginUser;
-  varying_.offsets = fields.offsets();
+  places_.offsets = fields.offsets();
   for (PetscInt c = 0; c < cells_; ++c) fields.append(c, "", cell_constants_);
   for (Facets *facets : facets_) {
     const char *surface;
     PetscCall(PetscObjectGetName((PetscObject)facets->key.label, &surface));
     for (const PetscInt cell : facets->cells) fields.append(cell, surface, facets->constants);
   }
-  PetscCall(VaryingConstants::attach(ds_, &varying_));
+  PetscCall(PlaceData::attach(ds_, &places_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -270,7 +280,7 @@ PetscErrorCode Assembly::for_blocks(Part part, Vec x, Vec x_t, PetscInt result_s
     std::fill(results.begin(), results.end(), 0.0);
     log_.timing = block % timed_share == 0;
     if (log_.timing) log_.timed_cells += n;
-    PetscCall(put_varying(cell_constants_, begin));
+    PetscCall(put_places(cell_constants_, true, begin));
     PetscCall(on_cells(n, &geom, u.data(), u_t.data(), results.data()));
     for (PetscInt i = 0; i < n; ++i) PetscCall(scatter(begin + i, &results[i * result_size]));
   }
@@ -283,7 +293,7 @@ PetscErrorCode Assembly::for_blocks(Part part, Vec x, Vec x_t, PetscInt result_s
       for (PetscInt i = 0; i < n; ++i) gather(i, facets->cells[begin + i]);
       std::fill(results.begin(), results.end(), 0.0);
       PetscCall(PetscFEGeomGetChunk(facets->geom, begin, begin + n, &chunk));
-      PetscCall(put_varying(facets->constants, begin));
+      PetscCall(put_places(facets->constants, false, begin));
       PetscCall(on_facets(*facets, n, chunk, u.data(), u_t.data(), results.data()));
       PetscCall(PetscFEGeomRestoreChunk(facets->geom, begin, begin + n, &chunk));
       for (PetscInt i = 0; i < n; ++i) PetscCall(scatter(facets->cells[begin + i], &results[i * result_size]));
@@ -296,23 +306,24 @@ PetscErrorCode Assembly::for_blocks(Part part, Vec x, Vec x_t, PetscInt result_s
 /// Other types of PetscFE know one set of constants for all places of a call.
 PetscInt Assembly::places_per_call() const
 {
-  return rate_ds_ && !varying_.offsets.empty() ? 1 : block_cells;
+  return rate_ds_ && !places_.offsets.empty() ? 1 : block_cells;
 }
 
-/// Lets the next call find the constants of its places, the first of which is @p begin.
-PetscErrorCode Assembly::put_varying(const std::vector<PetscReal> &rows, PetscInt begin)
+/// Lets the next call find what is its places' own; the first of them is @p begin.
+PetscErrorCode Assembly::put_places(const std::vector<PetscReal> &rows, bool cells, PetscInt begin)
 {
-  const std::size_t n = varying_.offsets.size();
+  const std::size_t n = places_.offsets.size();
   PetscInt n_constants;
   const PetscScalar *constants;
 
   PetscFunctionBeginUser;
+  if (memory_) places_.memory = cells ? memory_->at(begin, 0) : Memory();
   if (n == 0) PetscFunctionReturn(PETSC_SUCCESS);
-  varying_.rows = &rows[static_cast<std::size_t>(begin) * n];
+  places_.rows = &rows[static_cast<std::size_t>(begin) * n];
   if (places_per_call() > 1) PetscFunctionReturn(PETSC_SUCCESS);
   PetscCall(PetscDSGetConstants(ds_, &n_constants, &constants));
   std::vector<PetscScalar> local(constants, constants + n_constants);
-  for (std::size_t k = 0; k < n; ++k) local[static_cast<std::size_t>(varying_.offsets[k])] = varying_.rows[k];
+  for (std::size_t k = 0; k < n; ++k) local[static_cast<std::size_t>(places_.offsets[k])] = places_.rows[k];
   PetscCall(PetscDSSetConstants(ds_, n_constants, local.data()));
   PetscFunctionReturn(PETSC_SUCCESS);
 }

@@ -170,6 +170,7 @@ struct PointData {
   PetscScalar *weights;                ///< quadrature weight times det J
   PetscReal *x, *normals;              ///< [point][3]
   std::vector<PointState> states;
+  std::vector<Memory> memory; ///< [point]; empty if nothing is remembered here
 
   PointData(const Fields &f, Scratch &scratch, bool matrices)
       : fields(&f), states(static_cast<std::size_t>(f.points)), with_gradients(matrices)
@@ -275,21 +276,22 @@ public:
     const Clock clock(*this, reinterpret_cast<void (*)(void)>(f));
     for (PetscInt q = 0; q < data.fields->points; ++q)
       f(dim, data.fields->n, precomputed_state, data.fields->uOff, data.fields->uOff_x, u(q), u_t(q), u_x(q), nullptr,
-        data.fields->uOff_x, state(q), nullptr, rate_x(q), t, data.x + q * dim, nc, constants, out + q * stride);
+        data.fields->uOff_x, state(q), memory(q), rate_x(q), t, data.x + q * dim, nc, constants, out + q * stride);
   }
   void operator()(PetscPointJac g, PetscScalar *out, PetscInt stride) const
   {
     const Clock clock(*this, reinterpret_cast<void (*)(void)>(g));
     for (PetscInt q = 0; q < data.fields->points; ++q)
       g(dim, data.fields->n, precomputed_state, data.fields->uOff, data.fields->uOff_x, u(q), u_t(q), u_x(q), nullptr,
-        data.fields->uOff_x, state(q), nullptr, rate_x(q), t, shift, data.x + q * dim, nc, constants, out + q * stride);
+        data.fields->uOff_x, state(q), memory(q), rate_x(q), t, shift, data.x + q * dim, nc, constants,
+        out + q * stride);
   }
   void operator()(PetscBdPointFunc f, PetscScalar *out, PetscInt stride) const
   {
     const Clock clock(*this, reinterpret_cast<void (*)(void)>(f));
     for (PetscInt q = 0; q < data.fields->points; ++q)
       f(dim, data.fields->n, precomputed_state, data.fields->uOff, data.fields->uOff_x, u(q), u_t(q), u_x(q), nullptr,
-        data.fields->uOff_x, state(q), nullptr, rate_x(q), t, data.x + q * dim, data.normals + q * dim, nc, constants,
+        data.fields->uOff_x, state(q), memory(q), rate_x(q), t, data.x + q * dim, data.normals + q * dim, nc, constants,
         out + q * stride);
   }
   void operator()(PetscBdPointJac g, PetscScalar *out, PetscInt stride) const
@@ -297,7 +299,7 @@ public:
     const Clock clock(*this, reinterpret_cast<void (*)(void)>(g));
     for (PetscInt q = 0; q < data.fields->points; ++q)
       g(dim, data.fields->n, precomputed_state, data.fields->uOff, data.fields->uOff_x, u(q), u_t(q), u_x(q), nullptr,
-        data.fields->uOff_x, state(q), nullptr, rate_x(q), t, shift, data.x + q * dim, data.normals + q * dim, nc,
+        data.fields->uOff_x, state(q), memory(q), rate_x(q), t, shift, data.x + q * dim, data.normals + q * dim, nc,
         constants, out + q * stride);
   }
 
@@ -328,6 +330,10 @@ private:
   const PetscScalar *u_t(PetscInt q) const { return data.u_t + q * data.fields->total_components; }
   const PetscScalar *u_x(PetscInt q) const { return data.u_x + q * data.fields->total_components * dim; }
   const PetscScalar *rate_x(PetscInt q) const { return data.rate_x + q * data.fields->total_components * dim; }
+  const PetscScalar *memory(PetscInt q) const
+  {
+    return data.memory.empty() ? nullptr : reinterpret_cast<const PetscScalar *>(&data.memory[q]);
+  }
   const PetscScalar *state(PetscInt q) const { return reinterpret_cast<const PetscScalar *>(&data.states[q]); }
 
   const PointData &data;
@@ -511,8 +517,8 @@ public:
     PetscCall(PetscQuadratureGetData(rule, nullptr, nullptr, nullptr, &reference_, &weights_));
     PetscCall(facets_ ? PetscDSGetFaceTabulation(ds_, &T) : PetscDSGetTabulation(ds_, &T));
     PetscCall(PetscDSGetConstants(ds_, &n_constants, &constants));
-    PetscCall(VaryingConstants::find(ds_, &varying_));
-    if (varying_) {
+    PetscCall(PlaceData::find(ds_, &places_data_));
+    if (places_data_ && !places_data_->offsets.empty()) {
       local_constants_.assign(constants, constants + n_constants);
       constants = local_constants_.data();
     }
@@ -525,14 +531,26 @@ public:
 
   const Fields &fields() const { return fields_[0]; }
 
+  /// Makes room for what is remembered at the points, if anything is.
+  void remember(PointData &data) const
+  {
+    if (places_data_ && places_data_->memory.last) data.memory.resize(static_cast<std::size_t>(fields().points));
+  }
   /// Fills @p data, and the constants that differ, for place @p e.
   void visit(PetscInt e, const PetscScalar *coefficients, const PetscScalar *coefficients_t, PointData &data)
   {
-    if (varying_) {
-      const std::size_t n = varying_->offsets.size();
+    if (places_data_) {
+      const std::size_t n = places_data_->offsets.size();
+      const PetscInt width = places_data_->memory_width, begin = e * fields().points * width;
+      if (places_data_->memory.last)
+        for (PetscInt q = 0; q < fields().points; ++q) {
+          const Memory &first = places_data_->memory;
+          data.memory[q] = {first.last + begin + q * width,
+                            first.earlier ? first.earlier + begin + q * width : nullptr};
+        }
       for (std::size_t k = 0; k < n; ++k)
-        local_constants_[static_cast<std::size_t>(varying_->offsets[k])] =
-            varying_->rows[static_cast<std::size_t>(e) * n + k];
+        local_constants_[static_cast<std::size_t>(places_data_->offsets[k])] =
+            places_data_->rows[static_cast<std::size_t>(e) * n + k];
     }
     const PetscInt stride = geom_->numPoints, size = fields().element_size, manifold = facets_ ? dim - 1 : dim;
     const PetscReal *inverse = (facets_ ? geom_->suppInvJ[0] : geom_->invJ) + e * stride * dim * dim;
@@ -564,7 +582,7 @@ private:
   const PetscReal *reference_ = nullptr, *weights_ = nullptr;
   std::optional<Scratch> tables_;
   Fields fields_[4];
-  VaryingConstants *varying_ = nullptr;
+  PlaceData *places_data_ = nullptr;
   std::vector<PetscScalar> local_constants_;
 };
 
@@ -590,6 +608,7 @@ PetscErrorCode integrate_vectors(PetscDS ds, PetscWeakForm wf, const PetscFormKe
   const PetscInt Nq = fields.points;
   Scratch work(PointData::scratch_size(fields) + 2 * Scratch::padded(Nq * 9));
   PointData data(fields, work, false);
+  places.remember(data);
   PetscScalar *f0 = work.take(Nq * 3), *f1 = work.take(Nq * 9);
   const Caller call(data, t, 0, places.n_constants, places.constants, places.log);
 
@@ -636,6 +655,7 @@ PetscErrorCode integrate_matrices(PetscDS ds, PetscWeakForm wf, const PetscFormK
   const PetscInt Nq = fields.points;
   Scratch work(PointData::scratch_size(fields) + MatrixBuilder::scratch_size(fields) + 4 * Scratch::padded(Nq * 81));
   PointData data(fields, work, true);
+  places.remember(data);
   const MatrixBuilder builder(data, work);
   PetscScalar *g0 = work.take(Nq * 9), *g1 = work.take(Nq * 27), *g2 = work.take(Nq * 27), *g3 = work.take(Nq * 81);
   const Caller call(data, t, shift, places.n_constants, places.constants, places.log);
@@ -764,7 +784,7 @@ PetscErrorCode create_fe(PetscFE fe)
 
 namespace {
 
-constexpr const char *log_name = "pulmo_integration_log", *varying_name = "pulmo_varying_constants";
+constexpr const char *log_name = "pulmo_integration_log", *places_name = "pulmo_places";
 
 PetscErrorCode attach_pointer(PetscDS ds, const char *name, void *pointer)
 {
@@ -806,18 +826,18 @@ PetscErrorCode IntegrationLog::find(PetscDS ds, IntegrationLog **log)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode VaryingConstants::attach(PetscDS ds, VaryingConstants *varying)
+PetscErrorCode PlaceData::attach(PetscDS ds, PlaceData *places)
 {
-  return attach_pointer(ds, varying_name, varying);
+  return attach_pointer(ds, places_name, places);
 }
 
-PetscErrorCode VaryingConstants::find(PetscDS ds, VaryingConstants **varying)
+PetscErrorCode PlaceData::find(PetscDS ds, PlaceData **places)
 {
   void *pointer;
 
   PetscFunctionBeginUser;
-  PetscCall(find_pointer(ds, varying_name, &pointer));
-  *varying = static_cast<VaryingConstants *>(pointer);
+  PetscCall(find_pointer(ds, places_name, &pointer));
+  *places = static_cast<PlaceData *>(pointer);
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

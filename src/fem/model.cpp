@@ -1,6 +1,7 @@
 #include "pulmo/fem/model.hpp"
 
 #include "pulmo/fem/pattern.hpp"
+#include "pulmo/fem/point_memory.hpp"
 #include "pulmo/mesh/mesh.hpp"
 #include "pulmo/physics/parameter_fields.hpp"
 
@@ -16,6 +17,9 @@ namespace {
 constexpr PetscReal rounding = 1e-14;
 
 } // namespace
+
+Model::Model() = default;
+Model::~Model() = default;
 
 PetscErrorCode Model::declare(Options &options, const Elements &elements)
 {
@@ -51,6 +55,14 @@ PetscErrorCode Model::build(Composition composition, PetscReal modulus)
   PetscCall(assembly_.setup(dm_, rate_ds, this->composition().varying()));
   row_scale_.assign(this->composition().fields().size(), 1);
   PetscCall(set_step(1, 0));
+  if (this->composition().memory_width() == 0) PetscFunctionReturn(PETSC_SUCCESS);
+  PulmoUserCheck(own_, PetscObjectComm((PetscObject)(DM)dm_),
+                 "effect %s remembers what happened at the points, which needs pulmo's own integration; leave "
+                 "-petscfe_type out",
+                 this->composition().memories().front().effect.c_str());
+  memory_ = std::make_unique<PointMemory>();
+  PetscCall(memory_->setup(*this));
+  PetscCall(assembly_.remember(*memory_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

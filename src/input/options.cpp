@@ -378,6 +378,26 @@ PetscErrorCode Options::names(const std::string &name, const std::string &help, 
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode Options::reals(const std::string &name, const std::string &unit, Range range, const std::string &help,
+                              std::vector<PetscReal> &value)
+{
+  std::string raw, text;
+  bool is_given;
+
+  PetscFunctionBeginUser;
+  for (const PetscReal v : value) text += (text.empty() ? "" : ",") + number_text(v);
+  PetscCall(find(name, text, unit, "each " + range.text(), help, raw, is_given));
+  if (!is_given) PetscFunctionReturn(PETSC_SUCCESS);
+  value.clear();
+  for (const std::string &part : split(raw, ',')) {
+    double number;
+    PetscCall(parse_number(full(name), part, unit, range, number));
+    value.push_back(number);
+  }
+  PulmoUserCheck(!value.empty(), comm_, "option %s needs a number", full(name).c_str());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode Options::vector(const std::string &name, const std::string &unit, const std::string &help,
                                PetscReal value[3])
 {

@@ -1,5 +1,7 @@
 #include "pulmo/observers/energy.hpp"
 
+#include "pulmo/fem/point_memory.hpp"
+
 #include "pulmo/base/units.hpp"
 
 #include <algorithm>
@@ -127,7 +129,10 @@ PetscErrorCode EnergyAudit::integrate(const Part &part, const StepReport &step, 
     sampling_.sample(e, x_before.data(), before);
     for (std::size_t q = 0; q < weights.size(); ++q) {
       Sampling::make_rates(before[q], dt, now[q]);
-      const Point a = sampling_.point(now[q], e, t, step_now), b = sampling_.point(before[q], e, t - dt, step_before);
+      const Memory memory =
+          model_.memory() && part.surface.empty() ? model_.memory()->at(e.cell, static_cast<PetscInt>(q)) : Memory();
+      const Point a = sampling_.point(now[q], e, t, step_now, memory),
+                  b = sampling_.point(before[q], e, t - dt, step_before, memory);
       for (std::size_t k = 0; k < part.terms.size(); ++k)
         sums[part.account[k]] += weights[q] * e.measure * part.terms[k]->density(a, b, constants);
     }

@@ -26,7 +26,7 @@ PetscErrorCode Composition::check_parameters(MPI_Comm comm) const
 
 PetscInt Composition::constant_at(const PetscReal *parameter, const char **owner) const
 {
-  PetscInt offset = 1 + 2 * static_cast<PetscInt>(parameters_.size() + 1) +
+  PetscInt offset = 1 + 2 * static_cast<PetscInt>(1 + parameters_.size() + memories_.size()) +
                     static_cast<PetscInt>(sizeof(Step) / sizeof(PetscScalar)); // as constants() lists them
   for (const ParameterBlock &block : parameters_) {
     if (!std::less<>()(parameter, block.data) && std::less<>()(parameter, block.data + block.count)) {
@@ -49,20 +49,24 @@ std::vector<std::string> Composition::surfaces_that_read(const char *owner) cons
 
 std::vector<PetscScalar> Composition::constants(const Step &step) const
 {
-  std::vector<ParameterBlock> blocks = parameters_;
+  const std::size_t blocks = 1 + parameters_.size() + memories_.size();
+  std::vector<PetscScalar> all(1, static_cast<PetscScalar>(blocks));
+  auto offset = static_cast<PetscInt>(1 + 2 * blocks);
+  const auto list = [&](PetscScalar tag, PetscInt count) {
+    all.push_back(tag);
+    all.push_back(static_cast<PetscScalar>(offset));
+    offset += count;
+  };
+  const auto *of_step = reinterpret_cast<const PetscScalar *>(&step);
+  constexpr auto step_size = static_cast<PetscInt>(sizeof(Step) / sizeof(PetscScalar));
 
   // the step is asked for by every kernel: first in the directory
-  blocks.insert(blocks.begin(),
-                {Step::owner, reinterpret_cast<const PetscScalar *>(&step), sizeof(Step) / sizeof(PetscScalar)});
-  const auto n = static_cast<PetscInt>(blocks.size());
-  std::vector<PetscScalar> all(1, static_cast<PetscScalar>(n));
-  PetscInt offset = 1 + 2 * n;
-  for (const ParameterBlock &block : blocks) {
-    all.push_back(constants::tag(block.owner));
-    all.push_back(static_cast<PetscScalar>(offset));
-    offset += block.count;
-  }
-  for (const ParameterBlock &block : blocks) all.insert(all.end(), block.data, block.data + block.count);
+  list(constants::tag(Step::owner), step_size);
+  for (const ParameterBlock &block : parameters_) list(constants::tag(block.owner), block.count);
+  for (const MemorySpec &memory : memories_) list(constants::memory_tag(memory.owner), 1);
+  all.insert(all.end(), of_step, of_step + step_size);
+  for (const ParameterBlock &block : parameters_) all.insert(all.end(), block.data, block.data + block.count);
+  for (const MemorySpec &memory : memories_) all.push_back(static_cast<PetscScalar>(memory.offset));
   return all;
 }
 

@@ -7,6 +7,7 @@
 #include "pulmo/physics/effects/support.hpp"
 #include "pulmo/physics/effects/traction.hpp"
 #include "pulmo/physics/effects/tube.hpp"
+#include "pulmo/physics/effects/viscoelastic.hpp"
 #include "pulmo/physics/tissue/berger.hpp"
 #include "pulmo/physics/tissue/birzle.hpp"
 #include "pulmo/physics/tissue/ma.hpp"
@@ -33,6 +34,7 @@ Registry Registry::standard()
   r.effect<Support>();
   r.effect<Traction>();
   r.effect<Tube>();
+  r.effect<Viscoelastic>();
   return r;
 }
 

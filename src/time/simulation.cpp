@@ -261,6 +261,10 @@ PetscErrorCode Simulation::before_stage(PetscReal t)
   PetscCall(TSGetTime(ts_, &begin));
   PetscCall(TSGetTimeStep(ts_, &dt));
   PetscCall(scheme_.begin_stage(t, dt));
+  if (model_.memory()) {
+    model_.memory()->settle();
+    model_.memory()->look_back(scheme_.looks_back_at());
+  }
   airway_.freeze(false);
   airway_.begin_stage(t, begin + dt);
   model_.set_load(std::min<PetscReal>(1, (begin + dt) / std::min(phases_.front().dt.value_or(wanted_dt_), end_)));
@@ -516,9 +520,13 @@ PetscErrorCode Simulation::accept_stage(PetscReal t, Vec X, PetscBool *accept)
       candidate_ = {t, measures.volume_change / units::mm3_per_ml, pressure / units::kPa_per_cmH2O};
       PetscCall(judge(t, measures.volume_change, pressure, solved));
       *accept = PetscBool(solved);
-      if (solved)
+      if (solved) {
+        if (model_.memory() && scheme_.half_step()) {
+          PetscCall(model_.memory()->compute(t, local_, rate_));
+          model_.memory()->keep_middle();
+        }
         PetscCall(scheme_.accept_stage(model_, t, measures.volume_change, local_));
-      else
+      } else
         PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED)); // a shorter step would be solved no better
     }
   }
@@ -693,6 +701,10 @@ PetscErrorCode Simulation::after_step()
   newton_ = krylov_ = 0;
   const PetscReal lost = scheme_.flow(measures.volume_change) - row.flow * units::mm3_per_ml;
   delivered_ += (row.volume - accepted_.volume) * units::mm3_per_ml - lost / scheme_.slope();
+  if (model_.memory()) {
+    PetscCall(model_.memory()->compute(t, local_, rate_));
+    model_.memory()->accept();
+  }
   PetscCall(scheme_.accept(model_, t, measures.volume_change, local_));
   step_control_.accept({t, row.volume, row.pressure});
   balance_.accept();

@@ -93,6 +93,7 @@ PetscErrorCode Simulation::persist(Archive &archive)
     PetscCall(airway_.restore(state_));
   }
   PetscCall(scheme_.persist(archive, model_, accepted_.time, accepted_.volume * units::mm3_per_ml, before_));
+  if (model_.memory()) PetscCall(model_.memory()->persist(archive, scheme_.multistep()));
   PetscCall(step_control_.persist(archive));
   PetscCall(predictor_.persist(archive, state_));
   for (Observer *observer : observers_) PetscCall(observer->persist(archive, before_));

@@ -3,6 +3,7 @@
 #pragma once
 
 #include "pulmo/fem/model.hpp"
+#include "pulmo/mesh/cell_order.hpp"
 #include "pulmo/mesh/node_order.hpp"
 
 #include <cmath>
@@ -97,6 +98,8 @@ public:
   }
   /// A local vector with its constrained values, field by field.
   PetscErrorCode local(const std::string &name, Vec x);
+  /// @p width numbers for each cell of this rank, [cell][number].
+  PetscErrorCode cells(const std::string &name, std::size_t width, std::vector<double> &values);
   /// A global vector; what is constrained is not in it.
   PetscErrorCode global(const std::string &name, Vec X);
   /// User error unless @p good (the same on all ranks): the file does not hold @p name as this program needs it.
@@ -112,6 +115,7 @@ private:
 
   const Model &model_;
   const NodeOrder &order_;
+  CellOrder cell_order_; ///< made when it is needed
   MPI_Comm comm_;
   bool root_, reading_, good_ = true;
   std::string option_, path_; ///< of a file that is read

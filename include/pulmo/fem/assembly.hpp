@@ -23,6 +23,7 @@ struct Measures {
 };
 
 class ParameterFields;
+class PointMemory;
 
 /// Takes the element matrices of the cells while a Jacobian is assembled.
 class CellMatrices {
@@ -55,6 +56,8 @@ public:
   /// @p rate_ds: for PetscFE types other than pulmo's, the PetscDS of the auxiliary field that carries x_t. @p varying:
   /// parameters that differ from place to place, or null.
   PetscErrorCode setup(DM dm, PetscDS rate_ds, const ParameterFields *varying);
+  /// What kernels in the cells remember; must outlive this.
+  PetscErrorCode remember(const PointMemory &memory);
 
   /// Adds the residual of the local vectors @p x and @p x_t to F; rows of field f are multiplied by row_scale[f].
   PetscErrorCode residual(Part part, PetscReal t, Vec x, Vec x_t, const PetscReal row_scale[], Vec F);
@@ -88,7 +91,7 @@ private:
   PetscErrorCode for_blocks(Part part, Vec x, Vec x_t, PetscInt result_size, OnCells &&on_cells, OnFacets &&on_facets,
                             Scatter &&scatter);
   PetscInt places_per_call() const;
-  PetscErrorCode put_varying(const std::vector<PetscReal> &rows, PetscInt begin);
+  PetscErrorCode put_places(const std::vector<PetscReal> &rows, bool cells, PetscInt begin);
   PetscFEGeom block_geometry(PetscInt begin, PetscInt n);
   PetscErrorCode map_matrix(Mat A);
   PetscErrorCode add_to_matrix(PetscInt cell, const PetscScalar *matrix, const PetscReal row_scale[], Mat A);
@@ -106,7 +109,8 @@ private:
   std::vector<PetscReal> sample_weights_, relative_weights_;
   std::vector<Facets *> facets_;
   MatrixMap *map_ = nullptr;
-  VaryingConstants varying_;
+  PlaceData places_;
+  const PointMemory *memory_ = nullptr;
   std::vector<PetscReal> cell_constants_; ///< [cell][those that differ]
   IntegrationLog log_;
 };

@@ -10,7 +10,7 @@
 /// others; PETSc's own loops over fields remain correct.
 #pragma once
 
-#include "pulmo/base/petsc.hpp"
+#include "pulmo/physics/point.hpp"
 
 #include <map>
 #include <string>
@@ -34,15 +34,17 @@ struct IntegrationLog {
   static PetscErrorCode find(PetscDS ds, IntegrationLog **log);
 };
 
-/// Constants of PetscDS that differ between the cells or facets of a call. Composed with the PetscDS under the name
-/// "pulmo_varying_constants".
-struct VaryingConstants {
-  std::vector<PetscInt> offsets;   ///< which of the constants
+/// What differs between the cells or facets of a call beside the coefficients. Composed with the PetscDS under the name
+/// "pulmo_places".
+struct PlaceData {
+  std::vector<PetscInt> offsets;   ///< which of the constants of PetscDS
   const PetscReal *rows = nullptr; ///< [place of the call][offset]: their values
+  Memory memory;                   ///< of the first point of the first cell; null on facets
+  PetscInt memory_width = 0;       ///< scalars of a point; [cell][point][width]
 
-  static PetscErrorCode attach(PetscDS ds, VaryingConstants *varying);
+  static PetscErrorCode attach(PetscDS ds, PlaceData *places);
   /// Those of @p ds, or null.
-  static PetscErrorCode find(PetscDS ds, VaryingConstants **varying);
+  static PetscErrorCode find(PetscDS ds, PlaceData **places);
 };
 
 /// Registers the PetscFE type "pulmo".

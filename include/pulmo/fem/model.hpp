@@ -16,6 +16,8 @@ namespace pulmo {
 /// neither field hides behind the other in the norm.
 class Model {
 public:
+  Model();
+  ~Model();
   /// Declares -quadrature_degree; its default and least value are those of @p elements.
   PetscErrorCode declare(Options &options, const Elements &elements);
   /// @p modulus: tissue stiffness that scales the equations, kPa. The composition's effects must outlive the model.
@@ -32,6 +34,7 @@ public:
   /// Share of the dead loads that is there from the next set_step() on.
   void set_load(PetscReal load) { step_.load = load; }
   PetscReal load() const { return step_.load; }
+  const Step &step() const { return step_; }
   /// Whether the pressure is held on the surfaces open to the ventilator (so at the start), or free. Held nodes keep
   /// their rows: identity in the Jacobian, x - value in the residual that close_rows() leaves.
   void hold_airway(bool held) { airway_held_ = held; }
@@ -87,6 +90,9 @@ public:
   /// What kernels are told in a cell (of this rank, counted from 0), or on a facet of @p surface with that cell behind
   /// it, since the last set_step(); good until the next call.
   const PetscScalar *constants_at(PetscInt cell, const std::string &surface = "") const;
+
+  /// What effects remember at the points; null if none does.
+  PointMemory *memory() const { return memory_.get(); }
 
   PetscReal row_scale(PetscInt field) const { return row_scale_[field]; }
   PetscReal modulus() const { return modulus_; } ///< tissue stiffness that scales the equations, kPa
@@ -144,6 +150,7 @@ private:
   bool own_ = true;
   Assembly assembly_;
   CellMatrices *also_ = nullptr;
+  std::unique_ptr<PointMemory> memory_;
 };
 
 } // namespace pulmo

@@ -41,10 +41,11 @@ public:
   /// Gives @p now the rates that backward Euler finds in it after @p before, @p dt seconds earlier.
   static void make_rates(const Sample &before, PetscReal dt, Sample &now);
   /// A sample as kernels see it.
-  Point point(const Sample &sample, const Element &element, PetscReal t, const Step &step) const
+  Point point(const Sample &sample, const Element &element, PetscReal t, const Step &step,
+              const Memory &memory = {}) const
   {
-    return {sample.state, sample.u,   sample.p,   gas_ ? sample.grad_p : nullptr,  t, 0, sample.x, element.normal,
-            step,         sample.u_t, sample.p_t, gas_ ? sample.grad_p_t : nullptr};
+    return {sample.state, sample.u,   sample.p,   gas_ ? sample.grad_p : nullptr,   t,     0, sample.x, element.normal,
+            step,         sample.u_t, sample.p_t, gas_ ? sample.grad_p_t : nullptr, memory};
   }
 
 private:

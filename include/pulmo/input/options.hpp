@@ -59,6 +59,9 @@ public:
                         std::string &value);
   /// Names separated by commas.
   PetscErrorCode names(const std::string &name, const std::string &help, std::vector<std::string> &value);
+  /// Any number of numbers, separated by commas.
+  PetscErrorCode reals(const std::string &name, const std::string &unit, Range range, const std::string &help,
+                       std::vector<PetscReal> &value);
   /// Three numbers separated by commas.
   PetscErrorCode vector(const std::string &name, const std::string &unit, const std::string &help, PetscReal value[3]);
 

@@ -136,6 +136,20 @@ struct ParameterBlock {
   PetscInt count;
 };
 
+/// A quantity that an effect remembers at the points of the cells.
+struct Quantity {
+  std::string name, unit;
+};
+
+/// What one effect remembers there.
+struct MemorySpec {
+  std::string effect;
+  const char *owner; ///< of the parameters of its kernels
+  std::vector<Quantity> quantities;
+  MemoryFunction value; ///< what they are in a state
+  PetscInt offset = 0;  ///< among the scalars of a point
+};
+
 /// What the effects of a scene put together; filled by Effect::fields and Effect::terms.
 class Composition {
 public:
@@ -192,6 +206,21 @@ public:
   {
     energies_.push_back({effect_, kind, account, surface, density.function});
     if (density.owner) readers_.push_back({effect_, account, surface, density.owner});
+  }
+  /// Lets an effect remember quantities at the points of the cells. @p value computes all of them from a state, of
+  /// which the effect sees those before in Point::memory and Point::past(); it is called once for an accepted step, and
+  /// at the start (memory.last is null then). Kernels whose parameters have the same owner see what is remembered.
+  void remember(std::vector<Quantity> quantities, Callback<MemoryFunction> value)
+  {
+    const PetscInt offset = memory_width();
+    memories_.push_back({effect_, value.owner, std::move(quantities), value.function, offset});
+    readers_.push_back({effect_, "memory", "", value.owner});
+  }
+  const std::vector<MemorySpec> &memories() const { return memories_; }
+  /// Scalars that are remembered at a point.
+  PetscInt memory_width() const
+  {
+    return memories_.empty() ? 0 : memories_.back().offset + static_cast<PetscInt>(memories_.back().quantities.size());
   }
   void constrain(Constraint c)
   {
@@ -299,6 +328,7 @@ private:
   std::vector<EnergyTerm> energies_;
   std::vector<ParameterBlock> parameters_;
   std::vector<Reader> readers_;
+  std::vector<MemorySpec> memories_;
   std::shared_ptr<const ParameterFields> varying_;
 };
 
@@ -328,6 +358,7 @@ struct Settling {
 /// What one effect may know of the scene beside itself.
 struct SceneFacts {
   Elements elements;
+  const TissueLaw *law = nullptr;              ///< of the tissue
   bool airflow = false;                        ///< the pressure field exists
   std::vector<std::string> airway_surfaces;    ///< open to the ventilator; without airflow those that would be
   std::shared_ptr<const Programme> ventilator; ///< null without a ventilator

@@ -55,6 +55,43 @@ P get(const PetscScalar c[])
   return p;
 }
 
+/// Where an effect's quantities begin in what is remembered at a point: a block of its own in the directory.
+constexpr PetscScalar memory_tag(const char *owner)
+{
+  return tag(owner) + 0.5; // tags are whole
+}
+
+/// @p at a point's memory, moved on to the quantities of @p owner; nothing if it remembers none.
+template <class M>
+M memory(const M &at, const char *owner, const PetscScalar c[])
+{
+  const PetscScalar wanted = memory_tag(owner);
+  const auto n = static_cast<PetscInt>(c[0]);
+  for (PetscInt i = n - 1; at.last && i >= 0; --i) {
+    if (c[1 + 2 * i] != wanted) continue;
+    const auto offset = static_cast<PetscInt>(c[static_cast<PetscInt>(c[2 + 2 * i])]);
+    return {at.last + offset, at.earlier ? at.earlier + offset : nullptr};
+  }
+  return {};
+}
+
+/// A function among the constants: its address, bit for bit.
+template <class F>
+PetscScalar to_scalar(F function)
+{
+  PetscScalar bits;
+  static_assert(sizeof(function) == sizeof(bits));
+  std::memcpy(&bits, &function, sizeof(bits));
+  return bits;
+}
+template <class F>
+F to_pointer(PetscScalar bits)
+{
+  F function;
+  std::memcpy(&function, &bits, sizeof(bits));
+  return function;
+}
+
 } // namespace constants
 
 /// For kernels without parameters of their own.
@@ -62,29 +99,41 @@ struct NoParameters {};
 
 /// How the stage at hand makes rates: u_t = slope u + what the states before it add. Backward Euler: slope = 1 / dt.
 struct Stage {
-  PetscReal dt;           ///< from the last accepted state to the end of the stage, s
-  PetscReal slope;        ///< 1/s
-  bool multistep = false; ///< more than one state before counts (TimeScheme)
+  PetscReal dt;                              ///< from the last accepted state to the end of the stage, s
+  PetscReal slope;                           ///< 1/s
+  bool multistep = false;                    ///< more than one state before counts (TimeScheme)
+  PetscReal last_weight, earlier_weight = 0; ///< of these states in a rate, 1/s
 
-  Stage(PetscReal step, PetscReal a, bool several) : dt(step), slope(a), multistep(several) {}
+  Stage(PetscReal step, PetscReal a, bool several, PetscReal last = 0, PetscReal earlier = 0)
+      : dt(step), slope(a), multistep(several), last_weight(last), earlier_weight(earlier)
+  {}
   /// Backward Euler. Implicit: a step of that scheme is told by its size.
-  Stage(PetscReal step) : dt(step), slope(1 / step) {}
+  Stage(PetscReal step) : dt(step), slope(1 / step), last_weight(-1 / step) {}
 };
 
 /// What the time step tells every kernel.
 struct Step {
   static constexpr const char *owner = "step";
-  PetscScalar dt = 1;           ///< size of the step, s
-  PetscScalar slope = 1;        ///< d(rate)/d(state), 1/s
-  PetscScalar multistep = 0;    ///< 1: rates hold more than one state before (Stage)
-  PetscScalar gas_pressure = 0; ///< pressure held at the airway, kPa
-  PetscScalar airway_flux = 0;  ///< outward flux prescribed at the airway (0 while a pressure is held), mm/s
+  PetscScalar dt = 1;             ///< size of the step, s
+  PetscScalar slope = 1;          ///< d(rate)/d(state), 1/s
+  PetscScalar multistep = 0;      ///< 1: rates hold more than one state before (Stage)
+  PetscScalar last_weight = -1;   ///< of the state before in a rate, 1/s
+  PetscScalar earlier_weight = 0; ///< of the one before that
+  PetscScalar gas_pressure = 0;   ///< pressure held at the airway, kPa
+  PetscScalar airway_flux = 0;    ///< outward flux prescribed at the airway (0 while a pressure is held), mm/s
   PetscScalar load = 1; ///< share of the dead loads that is there: less than 1 where the first step of a run was cut
 
   Step() = default;
   explicit Step(const Stage &stage, PetscScalar gas = 0, PetscScalar flux = 0)
-      : dt(stage.dt), slope(stage.slope), multistep(stage.multistep ? 1 : 0), gas_pressure(gas), airway_flux(flux)
+      : dt(stage.dt), slope(stage.slope), multistep(stage.multistep ? 1 : 0), last_weight(stage.last_weight),
+        earlier_weight(stage.earlier_weight), gas_pressure(gas), airway_flux(flux)
   {}
+};
+
+/// What an effect remembers at a point of a cell (Composition::remember), as its own kernels see it.
+struct Memory {
+  const PetscScalar *last = nullptr; ///< at the last accepted state; null at the start, and where nothing is remembered
+  const PetscScalar *earlier = nullptr; ///< at the one before that, where the time scheme looks back so far
 };
 
 /// A quadrature point as a kernel sees it.
@@ -102,11 +151,21 @@ struct Point {
   PetscScalar p_t = 0;                   ///< kPa/s (airflow only)
   const PetscScalar *grad_p_t = nullptr; ///< Grad p_t, kPa/(mm s) (null without airflow)
 
+  Memory memory{};                        ///< of the kernel's own effect
+  const PetscScalar *constants = nullptr; ///< what all effects handed over (for LawFunctions)
+
+  /// The share of the past in the rate of quantity @p i that the effect remembers: dy/dt = step.slope y + past(i).
+  PetscScalar past(int i) const
+  {
+    return (memory.last ? step.last_weight * memory.last[i] : 0) +
+           (memory.earlier ? step.earlier_weight * memory.earlier[i] : 0);
+  }
   /// Pressure of the gas in the pores: the local field, or the uniform pressure without airflow, kPa.
   PetscScalar gas_pressure() const { return grad_p ? p : step.gas_pressure; }
 };
 
-/// NfAux that says: the auxiliary array is a PointState made by pulmo's integrator, its gradients those of the rates.
+/// NfAux that says: the auxiliary array is a PointState made by pulmo's integrator, its gradients those of the rates,
+/// its rates the Memory of all effects or null.
 constexpr PetscInt precomputed_state = -1;
 
 template <class P>
@@ -118,18 +177,21 @@ namespace detail {
 #define PULMO_POINT_ARGUMENTS                                                                                          \
   PetscInt, PetscInt Nf, PetscInt NfAux, const PetscInt uOff[], const PetscInt uOff_x[], const PetscScalar u[],        \
       const PetscScalar u_t[], const PetscScalar u_x[], const PetscInt[], const PetscInt aOff_x[],                     \
-      const PetscScalar a[], const PetscScalar[], const PetscScalar a_x[], PetscReal t
+      const PetscScalar a[], const PetscScalar a_t[], const PetscScalar a_x[], PetscReal t
 
 /// The point of a callback. Its kinematic state is handed in by pulmo's integrator, or made here in @p storage
 /// (stock PetscFE, where auxiliary fields of the same discretisation carry u_t and p_t).
-static inline Point make_point(PointState &storage, PetscInt Nf, PetscInt NfAux, const PetscInt uOff[],
-                               const PetscInt uOff_x[], const PetscScalar u[], const PetscScalar u_t[],
-                               const PetscScalar u_x[], const PetscInt aOff_x[], const PetscScalar a[],
-                               const PetscScalar a_x[], PetscReal t, PetscReal shift, const PetscReal x[],
-                               const PetscReal normal[], const PetscScalar c[])
+template <class P>
+Point make_point(PointState &storage, PetscInt Nf, PetscInt NfAux, const PetscInt uOff[], const PetscInt uOff_x[],
+                 const PetscScalar u[], const PetscScalar u_t[], const PetscScalar u_x[], const PetscInt aOff_x[],
+                 const PetscScalar a[], const PetscScalar a_t[], const PetscScalar a_x[], PetscReal t, PetscReal shift,
+                 const PetscReal x[], const PetscReal normal[], const PetscScalar c[])
 {
   const bool made = NfAux == precomputed_state, gas = Nf > pressure;
   if (!made) make_point_state(u_x + uOff_x[displacement], NfAux > 0 ? a_x + aOff_x[displacement] : nullptr, storage);
+  Memory memory;
+  if constexpr (!std::is_empty_v<P>)
+    if (made && a_t) memory = constants::memory(*reinterpret_cast<const Memory *>(a_t), P::owner, c);
   return {made ? *reinterpret_cast<const PointState *>(a) : storage,
           u + uOff[displacement],
           gas ? u[uOff[pressure]] : 0,
@@ -141,14 +203,16 @@ static inline Point make_point(PointState &storage, PetscInt Nf, PetscInt NfAux,
           constants::get<Step>(c),
           u_t ? u_t + uOff[displacement] : nullptr,
           gas && u_t ? u_t[uOff[pressure]] : 0,
-          gas && a_x && (made || NfAux > pressure) ? a_x + aOff_x[pressure] : nullptr};
+          gas && a_x && (made || NfAux > pressure) ? a_x + aOff_x[pressure] : nullptr,
+          memory,
+          c};
 }
 
 template <class P, Kernel<P> K>
 void volume_residual(PULMO_POINT_ARGUMENTS, const PetscReal x[], PetscInt, const PetscScalar c[], PetscScalar f[])
 {
   PointState storage;
-  K(make_point(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_x, t, 0, x, nullptr, c),
+  K(make_point<P>(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_t, a_x, t, 0, x, nullptr, c),
     constants::get<P>(c), f);
 }
 
@@ -157,7 +221,7 @@ void volume_jacobian(PULMO_POINT_ARGUMENTS, PetscReal shift, const PetscReal x[]
                      PetscScalar g[])
 {
   PointState storage;
-  K(make_point(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_x, t, shift, x, nullptr, c),
+  K(make_point<P>(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_t, a_x, t, shift, x, nullptr, c),
     constants::get<P>(c), g);
 }
 
@@ -166,7 +230,8 @@ void surface_residual(PULMO_POINT_ARGUMENTS, const PetscReal x[], const PetscRea
                       PetscScalar f[])
 {
   PointState storage;
-  K(make_point(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_x, t, 0, x, n, c), constants::get<P>(c), f);
+  K(make_point<P>(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_t, a_x, t, 0, x, n, c),
+    constants::get<P>(c), f);
 }
 
 template <class P, Kernel<P> K>
@@ -174,8 +239,8 @@ void surface_jacobian(PULMO_POINT_ARGUMENTS, PetscReal shift, const PetscReal x[
                       const PetscScalar c[], PetscScalar g[])
 {
   PointState storage;
-  K(make_point(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_x, t, shift, x, n, c), constants::get<P>(c),
-    g);
+  K(make_point<P>(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_t, a_x, t, shift, x, n, c),
+    constants::get<P>(c), g);
 }
 
 } // namespace detail
@@ -216,12 +281,33 @@ using EnergyKernel = PetscScalar (*)(const Point &now, const Point &before, cons
 /// The same as the energy audit calls it.
 using EnergyDensity = PetscScalar (*)(const Point &now, const Point &before, const PetscScalar constants[]);
 
+/// Computes what an effect remembers from the state at a point: Composition::remember().
+template <class P>
+using MemoryKernel = void (*)(const Point &now, const P &, PetscScalar value[]);
+using MemoryFunction = void (*)(const Point &now, const PetscScalar constants[], PetscScalar value[]);
+
 namespace detail {
+
+/// @p point with its memory as the owner of @p P sees it.
+template <class P>
+Point own_memory(Point point, const PetscScalar c[])
+{
+  if constexpr (!std::is_empty_v<P>)
+    if (point.memory.last) point.memory = constants::memory(point.memory, P::owner, c);
+  point.constants = c;
+  return point;
+}
 
 template <class P, EnergyKernel<P> K>
 PetscScalar energy_density(const Point &now, const Point &before, const PetscScalar c[])
 {
-  return K(now, before, constants::get<P>(c));
+  return K(own_memory<P>(now, c), own_memory<P>(before, c), constants::get<P>(c));
+}
+
+template <class P, MemoryKernel<P> K>
+void remembered(const Point &now, const PetscScalar c[], PetscScalar value[])
+{
+  K(own_memory<P>(now, c), constants::get<P>(c), value);
 }
 
 } // namespace detail
@@ -229,5 +315,9 @@ PetscScalar energy_density(const Point &now, const Point &before, const PetscSca
 /// Callback of an energy kernel.
 template <class P, EnergyKernel<P> K>
 constexpr Callback<EnergyDensity> energy_density{detail::energy_density<P, K>, owner_of<P>()};
+
+/// Callback of a memory kernel.
+template <class P, MemoryKernel<P> K>
+constexpr Callback<MemoryFunction> remembered{detail::remembered<P, K>, owner_of<P>()};
 
 } // namespace pulmo

@@ -173,6 +173,15 @@ struct TissueKernels {
   }
 };
 
+/// A law's stress and tangent for kernels of other effects, with its parameters among the constants of PetscDS
+/// (Point::constants); they add to what they are given.
+struct LawFunctions {
+  using Stress = void (*)(const PointState &, const PetscScalar constants[], PetscScalar P[9]);
+  using Tangent = void (*)(const PointState &, const PetscScalar constants[], PetscScalar A[81]);
+  Stress stress;
+  Tangent tangent;
+};
+
 /// A tissue law chosen at run time: its options, its parameters and its kernels.
 class TissueLaw {
 public:
@@ -186,6 +195,7 @@ public:
   virtual Callback<PetscPointJac> tangent_callback() const = 0;
   virtual Callback<EnergyDensity> stored_callback() const = 0;
   virtual Callback<EnergyDensity> numerical_callback() const = 0;
+  virtual LawFunctions functions() const = 0;
   /// Strain energy density W at a state, kPa.
   virtual PetscScalar energy(const PointState &state) const = 0;
   /// P' = dW/dF at a state, kPa, with the parameters among @p constants (Model::constants_at), or the law's own if
@@ -216,6 +226,15 @@ public:
   Callback<PetscPointJac> tangent_callback() const override { return volume_jacobian<Parameters, Kernels::tangent>; }
   Callback<EnergyDensity> stored_callback() const override { return energy_density<Parameters, Kernels::stored>; }
   Callback<EnergyDensity> numerical_callback() const override { return energy_density<Parameters, Kernels::numerical>; }
+  LawFunctions functions() const override
+  {
+    return {[](const PointState &s, const PetscScalar c[], PetscScalar P[9]) {
+              Kernels::stress(bare(s), constants::get<Parameters>(c), P);
+            },
+            [](const PointState &s, const PetscScalar c[], PetscScalar A[81]) {
+              Kernels::tangent(bare(s), constants::get<Parameters>(c), A);
+            }};
+  }
   PetscScalar energy(const PointState &state) const override { return Kernels::energy(state, parameters_); }
   using TissueLaw::stress;
   using TissueLaw::tangent;

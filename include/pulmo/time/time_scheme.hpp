@@ -4,6 +4,7 @@
 
 #include "pulmo/fem/archive.hpp"
 #include "pulmo/fem/model.hpp"
+#include "pulmo/fem/point_memory.hpp"
 
 #include <array>
 
@@ -41,7 +42,14 @@ public:
 
   PetscReal slope() const { return slope_; } ///< 1/s
   /// What kernels are told of the stage at hand.
-  Stage stage() const { return {dt_, slope_, multistep_}; }
+  Stage stage() const { return {dt_, slope_, multistep_, weight_[0], weight_[1]}; }
+  /// What a rate looks back at in the stage at hand.
+  PointMemory::Past looks_back_at() const
+  {
+    return !used_[1]              ? PointMemory::Past::last
+           : used_[1] == &middle_ ? PointMemory::Past::middle
+                                  : PointMemory::Past::earlier;
+  }
   /// Rate of the fields at the local state @p now, constrained values in place.
   PetscErrorCode rate(Vec now, Vec rate) const;
   /// The share of the past in the rate of volume, mm^3/s.

@@ -41,6 +41,12 @@ public:
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
+  PetscErrorCode announce(SceneFacts &facts) override
+  {
+    facts.law = &law();
+    return PETSC_SUCCESS;
+  }
+
   void fields(Composition &c) const override { c.field("displacement", 3, c.elements().displacement, "mm"); }
 
   PetscErrorCode terms(Composition &c, const SceneFacts &) const override

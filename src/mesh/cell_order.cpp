@@ -1,0 +1,119 @@
+#include "pulmo/mesh/cell_order.hpp"
+
+#include "pulmo/mesh/elements.hpp"
+
+#include <algorithm>
+#include <array>
+#include <numeric>
+
+namespace pulmo {
+
+namespace {
+
+/// The corners of a cell in the order of their coordinates.
+using Key = std::array<double, 12>;
+
+PetscErrorCode find_key(DM dm, PetscInt cell, Key &key)
+{
+  PetscInt begin, end, n, *closure = nullptr;
+  std::array<std::array<PetscReal, 3>, 4> corners{};
+  std::size_t found = 0;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMPlexGetDepthStratum(dm, 0, &begin, &end));
+  PetscCall(DMPlexGetTransitiveClosure(dm, cell, PETSC_TRUE, &n, &closure));
+  for (PetscInt i = 0; i < n; ++i)
+    if (closure[2 * i] >= begin && closure[2 * i] < end && found < corners.size())
+      PetscCall(node_coordinates(dm, closure[2 * i], corners[found++].data()));
+  PetscCall(DMPlexRestoreTransitiveClosure(dm, cell, PETSC_TRUE, &n, &closure));
+  std::sort(corners.begin(), corners.end());
+  for (std::size_t i = 0; i < 12; ++i) key[i] = corners[i / 3][i % 3];
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace
+
+PetscErrorCode CellOrder::setup(DM dm)
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)dm);
+  PetscInt begin, end;
+  std::vector<Key> mine, all;
+  std::vector<PetscMPIInt> counts, starts;
+  MPI_Datatype type;
+
+  PetscFunctionBeginUser;
+  dm_ = dm;
+  PetscCall(DMPlexGetHeightStratum(dm, 0, &begin, &end));
+  for (PetscInt c = begin; c < end; ++c) { // cells are not shared: pulmo distributes without overlap
+    cells_.push_back(c);
+    mine.emplace_back();
+    PetscCall(find_key(dm, c, mine.back()));
+  }
+  PetscCall(layout(1, counts, starts));
+  if (!counts.empty()) all.resize(static_cast<std::size_t>(starts.back()) + static_cast<std::size_t>(counts.back()));
+  PetscCallMPI(MPI_Type_contiguous(12, MPI_DOUBLE, &type));
+  PetscCallMPI(MPI_Type_commit(&type));
+  PetscCallMPI(MPI_Gatherv(mine.data(), static_cast<PetscMPIInt>(mine.size()), type, all.data(), counts.data(),
+                           starts.data(), type, 0, comm));
+  PetscCallMPI(MPI_Type_free(&type));
+  std::vector<std::size_t> order(all.size());
+  std::iota(order.begin(), order.end(), 0);
+  std::sort(order.begin(), order.end(), [&](std::size_t a, std::size_t b) { return all[a] < all[b]; });
+  place_.resize(all.size());
+  for (std::size_t i = 0; i < order.size(); ++i) place_[order[i]] = i;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode CellOrder::layout(std::size_t width, std::vector<PetscMPIInt> &counts,
+                                 std::vector<PetscMPIInt> &starts) const
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)dm_);
+  PetscMPIInt rank, size, n;
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  PetscCallMPI(MPI_Comm_size(comm, &size));
+  PetscCall(PetscMPIIntCast(static_cast<PetscInt>(width * cells_.size()), &n));
+  counts.assign(rank == 0 ? size : 0, 0);
+  PetscCallMPI(MPI_Gather(&n, 1, MPI_INT, counts.data(), 1, MPI_INT, 0, comm));
+  starts.resize(counts.size());
+  std::exclusive_scan(counts.begin(), counts.end(), starts.begin(), 0);
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode CellOrder::gather(std::size_t width, const std::vector<double> &mine, std::vector<double> &all) const
+{
+  std::vector<PetscMPIInt> counts, starts;
+  std::vector<double> gathered(width * place_.size());
+
+  PetscFunctionBeginUser;
+  PetscCall(layout(width, counts, starts));
+  PetscCallMPI(MPI_Gatherv(mine.data(), static_cast<PetscMPIInt>(mine.size()), MPI_DOUBLE, gathered.data(),
+                           counts.data(), starts.data(), MPI_DOUBLE, 0, PetscObjectComm((PetscObject)dm_)));
+  all.resize(gathered.size());
+  for (std::size_t c = 0; c < place_.size(); ++c) std::copy_n(&gathered[c * width], width, &all[place_[c] * width]);
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode CellOrder::scatter(std::size_t width, const std::vector<double> &all, std::vector<double> &mine,
+                                  bool &fits) const
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)dm_);
+  PetscMPIInt rank;
+  std::vector<PetscMPIInt> counts, starts;
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  fits = rank != 0 || all.size() == width * place_.size();
+  PetscCall(from_root(comm, fits));
+  if (!fits) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(layout(width, counts, starts));
+  std::vector<double> sent(all.size());
+  for (std::size_t c = 0; c < place_.size(); ++c) std::copy_n(&all[place_[c] * width], width, &sent[c * width]);
+  mine.resize(width * cells_.size());
+  PetscCallMPI(MPI_Scatterv(sent.data(), counts.data(), starts.data(), MPI_DOUBLE, mine.data(),
+                            static_cast<PetscMPIInt>(mine.size()), MPI_DOUBLE, 0, comm));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace pulmo
