@@ -1,5 +1,6 @@
 // What a run prints at its end.
 #include "pulmo/base/units.hpp"
+#include "pulmo/fem/point_memory.hpp"
 #include "pulmo/observers/output.hpp"
 
 #include <cmath>
@@ -181,6 +182,12 @@ PetscErrorCode print_ledger(MPI_Comm comm, const Scene &scene, const Model &mode
       if (c.effect == name)
         terms += "\n    " + c.name + " prescribed" + (c.surface.empty() ? " at vertices" : " on " + c.surface) + "  (" +
                  fields[c.field].name + ")";
+    for (const MemorySpec &m : composition.memories())
+      if (m.effect == name)
+        terms += "\n    remembers " + std::to_string(m.quantities.size()) + " quantities at each point of a cell (" +
+                 std::to_string(m.quantities.size() * model.memory()->bytes() /
+                                static_cast<std::size_t>(composition.memory_width())) +
+                 " bytes on this rank)";
     PetscCall(PetscPrintf(comm, "%-16s %-22s %9.4f %5.1f %%%s\n", name.c_str(),
                           own_fields.empty() ? "-" : own_fields.c_str(), spent[name],
                           seconds.total > 0 ? 100 * spent[name] / seconds.total : 0, terms.c_str()));

@@ -185,6 +185,8 @@ class Agreement(RestartCase):
         "BDF2": (CUBE + TWICE + ["-ts_type", "bdf"], 0.45),
         "BDF2, flow": (VCV + ["-ts_type", "bdf"], 0.45),
         "BDF2, limit": (BASE + pulmo.LITRE + TUBE + pulmo.programme(LIMITED) + ["-ts_type", "bdf"], 0.55),
+        "tissue that relaxes": (CUBE + TWICE + ["-viscoelastic"], 0.45),
+        "tissue that relaxes, BDF2": (CUBE + TWICE + ["-viscoelastic", "-ts_type", "bdf"], 0.45),
         "P1-P1": (CUBE + TWICE + ["-elements", "P1-P1", "-pressure_damping"], 0.45),
         "P3-P2": (VCV + ["-elements", "P3-P2"], 0.45),
         "steps by their error": (CUBE + TWICE + ["-ts_type", "bdf", "-ts_dt", "0.01", "-step_volume_tolerance", "0.5"], 0.45),
@@ -224,6 +226,7 @@ class Agreement(RestartCase):
     def test_from_two_ranks(self):
         self.run_scene("limit and tube", first=2, then=(1, 3))
         self.run_scene("vcv, common pressure", first=2, then=(2,))
+        self.run_scene("tissue that relaxes, BDF2", first=2, then=(1, 3))
 
     def test_other_solvers(self):
         """A kept Jacobian is not in the file: agreement is that of the solver's tolerance."""
