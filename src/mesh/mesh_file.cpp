@@ -1,6 +1,7 @@
 #include "pulmo/mesh/mesh_file.hpp"
 
 #include "pulmo/base/units.hpp"
+#include "pulmo/mesh/touching_faces.hpp"
 
 #include <algorithm>
 #include <charconv>
@@ -330,28 +331,107 @@ private:
 
   bool is_outer(const Facet &facet) const { return std::binary_search(outer_.begin(), outer_.end(), facet); }
 
-  /// Faces that lie on one another without being joined: nodes are there twice. A surface named on both sides is meant.
-  void check_tears() const
+  /// What the file calls a node; empty if it gives no numbers.
+  std::string tag_of(int node) const
   {
-    std::vector<int> place(mesh_.nodes.size()); // the first node there
-    bool twice = false;
-    for (std::size_t i = 0; i < place.size(); ++i) {
-      const bool same = i > 0 && mesh_.nodes[i] == mesh_.nodes[i - 1];
-      place[i] = same ? place[i - 1] : static_cast<int>(i);
-      twice = twice || same;
+    const auto index = static_cast<std::size_t>(std::find(number_.begin(), number_.end(), node) - number_.begin());
+    return index < file_.node_tags.size() ? std::to_string(file_.node_tags[index]) : "";
+  }
+
+  /// Names of an outer face, none if it has none.
+  std::vector<int> names_of(const Facet &face) const
+  {
+    const auto facet = std::lower_bound(facets_.begin(), facets_.end(), face,
+                                        [](const Named<3> &f, const Facet &n) { return f.nodes < n; });
+    return facet != facets_.end() && facet->nodes == face ? facet->names : std::vector<int>();
+  }
+
+  /// Faces that lie on one another.
+  struct Touching {
+    std::size_t n = 0;
+    double area = 0, distance = 0; ///< of one side; the largest one between nodes or faces
+    const Touch *first = nullptr;
+    std::set<int> names;
+  };
+
+  /// Faces that lie on one another without being joined: nodes are there twice, or two parts were meshed apart. A
+  /// surface named on both sides is meant.
+  void check_tears()
+  {
+    std::vector<BoundaryFace> faces;
+    auto next = outer_.begin(); // in the same order
+    for (const Face &face : faces_) {
+      if (next == outer_.end() || face.nodes != *next) continue;
+      ++next;
+      BoundaryFace one{face.nodes, 0, face.cell};
+      for (const int node : mesh_.cells[face.cell])
+        if (std::find(face.nodes.begin(), face.nodes.end(), node) == face.nodes.end()) one.opposite = node;
+      faces.push_back(one);
     }
-    if (!twice) return;
-    std::map<Facet, bool> named_at; // place of an outer face: whether it has a name
-    for (const Facet &face : outer_) {
-      const auto facet = std::lower_bound(facets_.begin(), facets_.end(), face,
-                                          [](const Named<3> &f, const Facet &n) { return f.nodes < n; });
-      const bool named = facet != facets_.end() && facet->nodes == face && !facet->names.empty();
-      const auto [other, first] =
-          named_at.insert({sorted(Facet{place[face[0]], place[face[1]], place[face[2]]}), named});
-      if (!first && !(named && other->second))
-        throw Fault{"is torn: its nodes are there twice on the face at " + at(face) +
-                    "; join them (gmsh: Coherence Mesh), or name both sides of what is meant to be a slit"};
+    const std::vector<Touch> touches = touching_faces(mesh_.nodes, faces, gap_share);
+    Touching overlapping, twice, apart, slit, gap;
+    for (const Touch &touch : touches) {
+      const bool torn = touch.share <= torn_share;
+      if (touch.overlaps && !torn) continue;
+      const std::vector<int> here = names_of(faces[touch.face].nodes), there = names_of(faces[touch.other].nodes);
+      const bool meant = !here.empty() && !there.empty();
+      if (meant && !torn) continue;
+      Touching &sum = touch.overlaps ? overlapping : meant ? slit : !torn ? gap : touch.matches ? twice : apart;
+      ++sum.n;
+      sum.area += area(faces[touch.face].nodes) / 2; // each side counts its own
+      sum.distance = std::max(sum.distance, touch.matches ? touch.twins_distance : touch.distance);
+      if (!sum.first) sum.first = &touch;
+      for (const auto &names : {here, there}) sum.names.insert(names.begin(), names.end());
     }
+    const auto what = [&](const Touching &sum) {
+      return counted(sum.n, "face") + text_of(" (%.4g mm^2)", area_mm2(sum.area));
+    };
+    const auto where = [&](const Touching &sum) { return "the first at " + at(faces[sum.first->face].nodes); };
+    if (overlapping.n > 0)
+      throw Fault{"has parts that overlap: " + what(overlapping) + ", " + where(overlapping) +
+                  ", lie on others whose cells are on the same side; remove what is there twice, or mesh anew"};
+    if (twice.n > 0 && twice.area >= apart.area) throw Fault{torn_text(twice, what(twice), where(twice))};
+    if (apart.n > 0)
+      throw Fault{
+          "has parts that meet without being joined: " + what(apart) + ", " + where(apart) +
+          ", lie on faces of other nodes; mesh the parts together (gmsh: BooleanFragments, or Coherence, before "
+          "it meshes), or name both sides of what is meant to be a slit"};
+    if (slit.n > 0) {
+      std::string names;
+      for (const int name : slit.names) names += (names.empty() ? "" : " and ") + quoted(name);
+      mesh_.notes.push_back(what(slit) + " of " + names + ", " + where(slit) +
+                            ", lie on one another without being joined: as both sides have a name, that is taken for a "
+                            "slit; if it is none, join them (gmsh: Coherence Mesh)");
+    }
+    if (gap.n > 0)
+      mesh_.notes.push_back(what(gap) + ", " + where(gap) + text_of(", are at most %.2g mm", scale_ * gap.distance) +
+                            " from others that they are not joined to, and not all have a name: that is taken for a "
+                            "gap; if it is none, mesh the parts together");
+  }
+
+  std::string torn_text(const Touching &torn, const std::string &what, const std::string &where) const
+  {
+    const auto [a, b] = torn.first->twins;
+    std::string nodes, join = "Coherence Mesh";
+    if (!tag_of(a).empty()) {
+      const long first = std::min(std::stol(tag_of(a)), std::stol(tag_of(b))),
+                 second = std::max(std::stol(tag_of(a)), std::stol(tag_of(b)));
+      nodes = ", where nodes " + std::to_string(first) + " and " + std::to_string(second) + " are two instead of one";
+    }
+    if (torn.distance > 0) {
+      Point low = mesh_.nodes.front(), high = low;
+      for (const Point &x : mesh_.nodes)
+        for (int d = 0; d < 3; ++d) {
+          low[d] = std::min(low[d], x[d]);
+          high[d] = std::max(high[d], x[d]);
+        }
+      // gmsh's tolerance is a share of the diagonal of all
+      join =
+          text_of("Geometry.Tolerance = %.2g, then Coherence Mesh", 2 * torn.distance / length(difference(high, low)));
+    }
+    return "is torn: " + what + ", " + where + nodes + ", lie on others without being joined to them" +
+           (torn.distance > 0 ? text_of(", nodes up to %.2g mm apart", scale_ * torn.distance) : "") +
+           "; join them (gmsh: " + join + "), or name both sides of what is meant to be a slit";
   }
 
   // ------------------------------------------------------------------------------------------------- several names

@@ -358,6 +358,7 @@ private:
       if (index >= 0) throw Fault{"gives the tag " + std::to_string(tags_[i]) + " to two nodes; save it anew in gmsh"};
       index = static_cast<int>(i);
     }
+    mesh_.node_tags = tags_;
   }
 
   int node_index(long tag) const

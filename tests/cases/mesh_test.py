@@ -1,5 +1,6 @@
 #!/usr/bin/python3
 """A mesh is its cells and its names: however a file writes them, the signals are the same to the last digit."""
+import itertools
 import re
 import unittest
 
@@ -7,6 +8,7 @@ import gmsh
 import meshio
 import numpy as np
 
+import case_meshes
 import pulmo_case as pulmo
 
 SCENE = pulmo.DIRECT + pulmo.PCV + ["-ventilator_pip", "3"]
@@ -219,6 +221,94 @@ class Cube22(unittest.TestCase):
         self.assertAlmostEqual(areas["airway"], 100, places=9)
         self.assertAlmostEqual(areas["pleura"], 500, places=9)
         self.assertAlmostEqual(case.json()["resistance_cmH2O_s_per_l"], 48.1, delta=0.05)
+
+
+class Torn(unittest.TestCase):
+    """Faces within the lung that lie on one another without being joined: gas and forces do not pass there."""
+
+    def torn(self, gap):
+        """The cube with a crack in its middle: cells on the left have nodes of their own there, moved by a gap in mm."""
+        parts = Parts()
+        left = parts.points[parts.cells].mean(axis=1)[:, 0] < 5
+        twin = np.intersect1d(parts.cells[left], parts.cells[~left])
+        twin = twin[parts.points[twin, 2] < 6]  # further up both sides are still one body
+        number = np.arange(len(parts.points))
+        number[twin] = len(parts.points) + np.arange(len(twin))
+        faces = {tuple(sorted(f)) for c in parts.cells[left] for f in itertools.combinations(c, 3)}
+        parts.facets = np.array([number[f] if tuple(sorted(f)) in faces else f for f in parts.facets])
+        parts.cells[left] = number[parts.cells[left]]
+        parts.points = np.concatenate([parts.points, parts.points[twin] - [gap, 0, 0]])
+        return parts
+
+    def refused(self, options, *words):
+        case = pulmo.Case(SCENE + options + ["-ts_max_time", "0.15"])
+        self.assertEqual(case.code, 1, case.tail())
+        self.assertEqual(case.err.count("pulmo: error: "), 1, case.err)
+        for word in words:
+            self.assertIn(word, case.err)
+        self.assertEqual(case.files(), [])
+        return case.err
+
+    def test_nodes_that_are_nearly_the_same(self):
+        plain = short_run(pulmo.mesh("cube_lung.msh")).signals()
+        for gap in 1e-12, 1e-8, 1e-4, -1e-4:
+            with self.subTest(gap=gap):
+                path = self.torn(gap).write(TAGS)
+                said = self.refused(["-dm_plex_filename", path], path, "is torn: ", "where nodes ", "join them (gmsh: ")
+                # what it says helps
+                tolerance = float(re.search(r"Geometry.Tolerance = (\S+), then Coherence Mesh", said)[1])
+                gmsh.initialize()
+                try:
+                    gmsh.option.setNumber("General.Terminal", 0)
+                    gmsh.open(path)
+                    gmsh.option.setNumber("Geometry.Tolerance", tolerance)
+                    gmsh.model.mesh.removeDuplicateNodes()
+                    joined = pulmo.scratch("joined.msh")
+                    gmsh.option.setNumber("Mesh.MshFileVersion", 2.2)
+                    gmsh.write(joined)
+                finally:
+                    gmsh.finalize()
+                rows = short_run(joined).signals()
+                for column in "volume_ml", "flow_ml_per_s":
+                    np.testing.assert_allclose(rows[column], plain[column], rtol=1e-4, atol=1e-4 * np.abs(plain[column]).max())
+
+    def test_a_mesh_that_is_scaled(self):
+        parts = self.torn(1e-4)
+        parts.points *= 1e-3
+        path = parts.write(TAGS)
+        self.refused(["-dm_plex_filename", path, "-mesh_scale", "1000"], "is torn: ", "mm apart")
+
+    def blocks(self, counts, gap=0.0):
+        """Two cubes of 10 mm beside one another, cut as they like; what is outside has a name, either end is an airway."""
+        (a, left), (b, right) = (case_meshes.kuhn(n, (10, 10, 10)) for n in counts)
+        points, tets = np.concatenate([a, b + [10 + gap, 0, 0]]), np.concatenate([left, right + len(a)])
+        facets = case_meshes.boundary(tets)
+        x = points[facets].mean(axis=1)[:, 0]
+        outside = np.abs(x - 10 - gap / 2) > 0.6 * gap + 1e-9
+        names = ["airway" if abs(v - 10 - gap / 2) > 9.999 + gap / 2 else "pleura" for v in x[outside]]
+        return case_meshes.write(points, tets, facets[outside], names)
+
+    def test_blocks_that_were_meshed_apart(self):
+        for gap in 0, 1e-7:
+            with self.subTest(gap=gap):
+                self.refused(self.blocks([(3, 3, 3), (2, 4, 4)], gap), "has parts that meet without being joined: ",
+                             "the first at (10, ", "mesh the parts together")
+
+    def test_slits_that_are_meant(self):
+        parts = self.torn(0)
+        faces, times = np.unique(np.sort(np.concatenate([parts.cells[:, list(c)] for c in itertools.combinations(range(4), 3)]), axis=1),
+                                 axis=0, return_counts=True)
+        named = {tuple(sorted(f)) for f in parts.facets}
+        slit = [f for f in faces[times == 1] if tuple(f) not in named]
+        parts.facets, parts.facet_names = np.concatenate([parts.facets, slit]), parts.facet_names + [["slit"]] * len(slit)
+        case = short_run(parts.write(TAGS | {(2, "slit"): 5}))
+        self.assertRegex(case.out, rf"pulmo: note: {len(slit)} faces \(.* mm\^2\) of 'slit', .*taken for a slit")
+
+    def test_narrow_gaps(self):
+        counts = [(3, 3, 3), (3, 3, 3)]
+        self.assertRegex(pulmo.finished(SCENE + self.blocks(counts, 0.03) + ["-ts_max_time", "0.05"]).out,
+                         r"pulmo: note: 36 faces \(100 mm\^2\), .* are at most 0.03 mm from others .*taken for a gap")
+        self.assertNotIn("taken for", pulmo.finished(SCENE + self.blocks(counts, 0.1) + ["-ts_max_time", "0.05"]).out)
 
 
 class Distribution(unittest.TestCase):

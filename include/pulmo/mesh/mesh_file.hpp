@@ -12,6 +12,12 @@ namespace pulmo {
 /// Cells whose volume is not above this share of (longest edge)^3 are degenerate.
 constexpr double degenerate_share = 1e-10 / 6;
 
+/// Faces of the boundary that are not further than this share of their cells' size from others lie on them. A fissure
+/// that is meshed as two surfaces is an order of magnitude wider: 0.1 mm at edges of 3 mm are 0.03.
+constexpr double torn_share = 1e-3;
+/// Up to this share they may be meant to: sides of a curved surface that were meshed apart are so far from each other.
+constexpr double gap_share = 2e-2;
+
 /// A mesh file as it was read.
 struct MeshFile {
   /// A physical group.
@@ -29,6 +35,7 @@ struct MeshFile {
   };
 
   std::vector<std::array<double, 3>> nodes; ///< as in the file, unscaled
+  std::vector<long> node_tags;              ///< their numbers in the file; empty if it has none
   std::vector<Element<4>> cells;            ///< left- or right-handed
   std::vector<Element<3>> facets;
   std::vector<Group> groups;
