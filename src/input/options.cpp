@@ -80,6 +80,21 @@ bool turned_off(const OptionList &list, const std::string &name)
   return off;
 }
 
+/// Whether whoever gave @p name knew that @p off, the last word on its effect, turns the effect off. What comes after
+/// that does. So does what stands beside it in one file or on the command line, unless the effect was turned on before:
+/// then it belongs to that.
+bool contradicts(const OptionList &sources, const std::string &name, const std::string &off)
+{
+  const auto last = [&](const std::string &option) {
+    return std::find_if(sources.rbegin(), sources.rend(), [&](const auto &s) { return s.first == option; });
+  };
+  const auto setting = last(name), by = last(off);
+  if (setting == sources.rend() || by == sources.rend()) return false;
+  const bool after = setting < by; // both count from the end
+  const bool on_before = std::any_of(std::next(by), sources.rend(), [&](const auto &s) { return s.first == off; });
+  return after || (setting->second == by->second && !on_before);
+}
+
 bool begins_with(const std::string &text, const std::string &start)
 {
   return text.rfind(start, 0) == 0;
@@ -596,7 +611,12 @@ PetscErrorCode Options::check_unknown() const
         idle = &d;
     }
     // an effect that the user turned off on purpose may keep its settings (from a scene file)
-    if (in_use || (idle && turned_off(list, groups_[idle->group].name))) continue;
+    const std::string effect = idle ? "-" + groups_[idle->group].name : "";
+    const bool off = idle && turned_off(list, groups_[idle->group].name);
+    if (in_use || (off && !contradicts(sources_, name, effect))) continue;
+    PulmoUserCheck(!off, comm_,
+                   "option %s (%s) has no effect in this scene, for %s is off (%s); leave it out, or leave out %s off",
+                   name.c_str(), source(name).c_str(), effect.c_str(), source(effect).c_str(), effect.c_str());
     PulmoUserCheck(!idle, comm_, "option %s has no effect in this scene: it needs %s", name.c_str(),
                    groups_[idle->group].enabled_by.c_str());
     for (const Group &group : groups_) {

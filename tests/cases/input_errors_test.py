@@ -440,6 +440,18 @@ def table(m):
         "tube without coefficients": (good + ["-tube"], ["-tube", "-tube_k1", "-tube_k2"]),
         "negative tube": (good + ["-tube", "-tube_k1", "-2"], ["-tube_k1", "-2", "out of range"]),
         "coefficient without tube": (good + ["-tube_k1", "2"], ["-tube_k1", "no effect", "-tube"]),
+        "setting after its effect was turned off": (good + ["-airflow", "off", "-airflow_permeability", "3"],
+                                                    ["-airflow_permeability (command line)", "-airflow is off (command line)"]),
+        "setting beside a switch that is off": (lung + ["-traction_value", "1,0,0", "-traction", "off"],
+                                                ["-traction_value", "-traction is off"]),
+        "setting of a surface after its effect was turned off": (
+            good + ["-chest_wall", "off", "-chest_wall_stiffness_airway", "1"],
+            ["-chest_wall_stiffness_airway", "no effect", "-chest_wall is off"]),
+        "setting of no ventilator": (good + ["-ventilator", "off", "-ventilator_pip", "3"],
+                                     ["-ventilator_pip", "no effect", "-ventilator is off"]),
+        "setting of an effect that a file turned off": (
+            good + pulmo.PAPER + ["-lumen_pressure_surfaces", "airway"],
+            ["-lumen_pressure_surfaces (command line)", "-lumen_pressure is off (", "paper.opts)"]),
         "tube without ventilator": (lung + ["-tube", "-tube_k1", "2"], ["-tube", "-ventilator"]),
         "trust region with a common pressure": (
             lung + ["-ventilator", "vcv", "-ventilator_flow_split", "common_pressure", "-snes_type", "newtontr"],
