@@ -14,6 +14,7 @@ class Support final : public Effect {
 public:
   const char *name() const override { return "support"; }
   const char *about() const override { return "prescribed displacement on surfaces, pins against rigid motions"; }
+  std::string example() const override { return "-support -support_rigid"; }
   bool active() const override { return on_; }
 
   PetscErrorCode declare(Options &options) override
