@@ -1,5 +1,6 @@
 #include "pulmo/mesh/mesh_file.hpp"
 
+#include "pulmo/base/space.hpp"
 #include "pulmo/base/units.hpp"
 #include "pulmo/mesh/touching_faces.hpp"
 
@@ -15,7 +16,7 @@ namespace pulmo {
 
 namespace {
 
-using Point = std::array<double, 3>;
+using Point = SpacePoint;
 using Facet = std::array<int, 3>; ///< nodes in ascending order
 using Cell = std::array<int, 4>;
 
@@ -44,26 +45,6 @@ double sixteen_digits(double x)
   const auto end = std::to_chars(text, text + sizeof(text), x, std::chars_format::scientific, 15).ptr;
   std::from_chars(text, end, x);
   return x + 0.0; // no -0
-}
-
-Point difference(const Point &a, const Point &b)
-{
-  return {a[0] - b[0], a[1] - b[1], a[2] - b[2]};
-}
-
-Point cross(const Point &a, const Point &b)
-{
-  return {a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]};
-}
-
-double dot(const Point &a, const Point &b)
-{
-  return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-}
-
-double length(const Point &a)
-{
-  return std::sqrt(dot(a, a));
 }
 
 template <std::size_t N>

@@ -1,5 +1,7 @@
 #include "pulmo/mesh/touching_faces.hpp"
 
+#include "pulmo/base/space.hpp"
+
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -9,28 +11,13 @@ namespace pulmo {
 
 namespace {
 
-using Point = std::array<double, 3>;
+using Point = SpacePoint;
 
 /// Normals of faces in one plane have at least this cosine: the sides of a badly joined curved surface do, those of an
 /// edge do not.
 constexpr double one_plane = 0.99;
 /// A centre may lie so far outside of a face, in shares of the face, and as far from it in shares of the coordinates.
 constexpr double rounding = 1e-12;
-
-Point difference(const Point &a, const Point &b)
-{
-  return {a[0] - b[0], a[1] - b[1], a[2] - b[2]};
-}
-
-Point cross(const Point &a, const Point &b)
-{
-  return {a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]};
-}
-
-double dot(const Point &a, const Point &b)
-{
-  return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-}
 
 /// Boxes of any size, each in the squares of a grid that is a little coarser than the box, so that a fine part of a
 /// mesh next to a coarse one costs nothing.
