@@ -35,7 +35,7 @@ PetscReal Balance::share(const Errors &errors, std::string &text) const
   return largest;
 }
 
-PetscErrorCode Balance::judge(int breath, PetscReal volume, PetscReal pressure, const Errors &errors,
+PetscErrorCode Balance::judge(int breath, PetscReal before, PetscReal volume, PetscReal pressure, const Errors &errors,
                               const std::function<PetscErrorCode(Loads &)> &load, bool &solved)
 {
   Errors left = errors;
@@ -45,7 +45,7 @@ PetscErrorCode Balance::judge(int breath, PetscReal volume, PetscReal pressure, 
   left.gas = std::max(errors.gas, std::abs(drift_ + step_drift_));
   if (breath != breath_) {
     if (breath_ == 0) size_.gas = 0; // what filled the lung before its first breath is no tidal volume
-    lowest_ = highest_ = volume;
+    lowest_ = highest_ = before;     // what the first step moves counts, too
   }
   breath_ = breath;
   lowest_ = std::min(lowest_, volume);
@@ -69,8 +69,9 @@ PetscErrorCode Balance::judge(int breath, PetscReal volume, PetscReal pressure, 
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-bool Balance::judge_run()
+bool Balance::judge_run(PetscReal gas)
 {
+  worst_.gas = std::max(worst_.gas, gas);
   worst_share_ = share(worst_, complaint_);
   return worst_share_ <= failure;
 }

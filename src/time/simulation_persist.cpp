@@ -91,12 +91,43 @@ PetscErrorCode Simulation::persist(Archive &archive)
     PetscCall(VecZeroEntries(state_));
     PetscCall(DMLocalToGlobal(model_.dm(), before_, INSERT_VALUES, state_));
     PetscCall(airway_.restore(state_));
+    PetscCall(check_state());
   }
   PetscCall(scheme_.persist(archive, model_, accepted_.time, accepted_.volume * units::mm3_per_ml, before_));
   if (model_.memory()) PetscCall(model_.memory()->persist(archive, scheme_.multistep()));
   PetscCall(step_control_.persist(archive));
   PetscCall(predictor_.persist(archive, state_));
   for (Observer *observer : observers_) PetscCall(observer->persist(archive, before_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Refuses a state that does not have the volume and the pressure of the last row: whatever took it there, it is not
+/// the state of these signals.
+PetscErrorCode Simulation::check_state()
+{
+  constexpr PetscReal same = 1e-9; // of the lung's volume, of the tissue's modulus: beyond rounding on any ranks
+  const auto &constraints = model_.composition().constraints();
+  Measures measures;
+  PetscReal pressure = accepted_.pressure * units::kPa_per_cmH2O;
+
+  PetscFunctionBeginUser;
+  PetscCall(model_.measure(before_, measures));
+  // another pressure may be prescribed at the rim of the airway, and is not the airway's
+  const bool other = std::any_of(constraints.begin(), constraints.end(),
+                                 [](const Constraint &c) { return c.field == pulmo::pressure && !c.at_airway; });
+  if (scene_.facts().airflow && scene_.facts().ventilator && !other)
+    PetscCall(model_.airway_mean_pressure(before_, pressure));
+  const PetscReal volume = measures.volume_change / units::mm3_per_ml, P = pressure / units::kPa_per_cmH2O,
+                  lung = scene_.mesh().volume() / units::mm3_per_ml, modulus = model_.modulus() / units::kPa_per_cmH2O;
+  PulmoUserCheck(std::abs(volume - accepted_.volume) <= same * (lung + std::abs(accepted_.volume)), options_.comm(),
+                 "-restart: the checkpoint's state does not belong to its signals: its volume is %.9g ml above rest, "
+                 "that of the last row %.9g ml; the file was changed: take another checkpoint, or run from the start",
+                 (double)volume, accepted_.volume);
+  PulmoUserCheck(std::abs(P - accepted_.pressure) <= same * (modulus + std::abs(accepted_.pressure)), options_.comm(),
+                 "-restart: the checkpoint's state does not belong to its signals: its airway pressure is %.9g cmH2O, "
+                 "that of the last row %.9g cmH2O; the file was changed: take another checkpoint, or run from the "
+                 "start",
+                 (double)P, accepted_.pressure);
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

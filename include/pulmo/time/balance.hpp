@@ -12,8 +12,9 @@ namespace pulmo {
 /// moves and the loads that it bears. A right solver file leaves 1e-7 of these or less; above 1e-4 the run warns, above
 /// 1e-2 it ends.
 ///
-/// A small volume or load counts as a thousandth of the lung's volume, or of the tissue's modulus on its surface, so
-/// that neither the first step of a ramp nor what -snes_atol leaves of a faint load is held against itself.
+/// What a step moves by itself counts from that step on. A small volume or load counts as a thousandth of the lung's
+/// volume, or of the tissue's modulus on its surface, so that neither a short step at the start of a ramp nor what
+/// -snes_atol leaves of a faint load is held against itself.
 class Balance {
 public:
   /// What a step leaves of its equations.
@@ -32,15 +33,15 @@ public:
 
   /// @p lung: volume at rest, mm^3; @p modulus: of the tissue, kPa.
   void setup(PetscReal lung, PetscReal modulus);
-  /// Takes note of a step of @p breath that is to be accepted and ends at @p volume (mm^3 above rest) and @p pressure
-  /// (kPa). @p load gives what acts on the nodes; it is asked only if it matters. @p solved is false if the step leaves
-  /// too much; complaint() then tells what.
-  PetscErrorCode judge(int breath, PetscReal volume, PetscReal pressure, const Errors &errors,
+  /// Takes note of a step of @p breath that is to be accepted, begins at volume @p before (mm^3 above rest) and ends at
+  /// @p volume and @p pressure (kPa). @p load gives what acts on the nodes; it is asked only if it matters. @p solved
+  /// is false if the step leaves too much; complaint() then tells what.
+  PetscErrorCode judge(int breath, PetscReal before, PetscReal volume, PetscReal pressure, const Errors &errors,
                        const std::function<PetscErrorCode(Loads &)> &load, bool &solved);
   /// The step that was judged last is accepted.
   void accept() { drift_ += step_drift_; }
-  /// At the end of the run: the same of its worst step.
-  bool judge_run();
+  /// At the end of the run: the same of its worst step, and of @p gas (mm^3), which the run lost or made in all.
+  bool judge_run(PetscReal gas = 0);
 
   /// Whether judge() came upon the first step that the user is to be warned of.
   bool warns() const { return warns_; }

@@ -96,6 +96,7 @@ private:
   PetscErrorCode start();
   PetscErrorCode persist_rows(Archive &archive);
   /// Finds the phase that goes on at what was read.
+  PetscErrorCode check_state();
   PetscErrorCode resume(const Archive &archive, PetscInt index, PetscReal wanted_dt, PetscReal phase_end);
   /// Ends the run with @p reason if a signal asks to stop.
   PetscErrorCode heed_signal(TSConvergedReason reason);
