@@ -24,6 +24,17 @@ std::optional<double> ratio(double a, double b)
   return b > 0 ? std::optional<double>(a / b) : std::nullopt;
 }
 
+/// By how much the volume of rows first ... last changes, ml; 0 where that is what a solver leaves of nothing.
+double movement(const std::vector<SignalRow> &rows, std::size_t first, std::size_t last)
+{
+  double low = rows[first].volume, high = low;
+  for (std::size_t i = first + 1; i <= last; ++i) {
+    low = std::min(low, rows[i].volume);
+    high = std::max(high, rows[i].volume);
+  }
+  return high - low > least_movement * rows[first].rest_volume ? high - low : 0;
+}
+
 /// The last row before the pause that ends at row @p end, not before row @p first.
 std::size_t before_pause(const std::vector<SignalRow> &rows, std::size_t first, std::size_t end)
 {
@@ -68,7 +79,8 @@ void add_pauses(const std::vector<SignalRow> &rows, std::size_t first, std::size
 
 std::vector<ClinicalEntry> clinical_entries(const ClinicalNumbers &n, const std::optional<double> &frc)
 {
-  const auto strain = frc ? std::optional<double>(n.tidal_volume / *frc) : std::nullopt;
+  const auto tidal = n.takes_in ? std::optional<double>(n.tidal_volume) : std::nullopt,
+             strain = frc && tidal ? std::optional<double>(*tidal / *frc) : std::nullopt;
   return {
       {"peak_inspiratory_pressure_cmH2O", "peak inspiratory pressure", "cmH2O", n.peak_pressure},
       {"plateau_pressure_cmH2O", "plateau pressure", "cmH2O", n.plateau_pressure},
@@ -76,7 +88,7 @@ std::vector<ClinicalEntry> clinical_entries(const ClinicalNumbers &n, const std:
       {"auto_peep_cmH2O", "auto-PEEP", "cmH2O", n.auto_peep},
       {"total_peep_cmH2O", "total PEEP", "cmH2O", n.total_peep},
       {"driving_pressure_cmH2O", "driving pressure", "cmH2O", n.driving_pressure},
-      {"tidal_volume_ml", "tidal volume", "ml", n.tidal_volume},
+      {"tidal_volume_ml", "tidal volume", "ml", tidal},
       {"trapped_volume_ml", "trapped volume", "ml", n.trapped_volume},
       {"peak_flow_ml_per_s", "peak inspiratory flow", "ml/s", n.peak_flow},
       {"peak_expiratory_flow_ml_per_s", "peak expiratory flow", "ml/s", n.peak_expiratory_flow},
@@ -158,6 +170,7 @@ std::vector<StaticPoint> static_points(const std::vector<SignalRow> &rows, std::
 void fit_single_compartment(const std::vector<SignalRow> &rows, std::size_t first, std::size_t last, double peep,
                             ClinicalNumbers &numbers, std::optional<double> start)
 {
+  if (!movement(rows, first, last)) return;
   const double V_start = start.value_or(rows[first].volume);
   double VV = 0, VQ = 0, QQ = 0, PV = 0, PQ = 0; // normal equations
   for (std::size_t i = first + 1; i <= last; ++i) {
@@ -174,7 +187,7 @@ void fit_single_compartment(const std::vector<SignalRow> &rows, std::size_t firs
   const double E = (PV * QQ - PQ * VQ) / determinant, R = (PQ * VV - PV * VQ) / determinant;
   if (!(E > 0)) return;
   numbers.compliance = 1 / E;
-  if (!rows[last].flow_resistance) return; // R would be what the curve of P over V leaves of a line
+  if (!rows[last].flow_resistance || !(R > 0)) return; // R would be what the curve of P over V leaves of a line
   numbers.resistance = R * 1000;
   numbers.time_constant = R / E;
 }
@@ -182,6 +195,7 @@ void fit_single_compartment(const std::vector<SignalRow> &rows, std::size_t firs
 void fit_with_intercept(const std::vector<SignalRow> &rows, std::size_t first, std::size_t last,
                         ClinicalNumbers &numbers)
 {
+  if (!movement(rows, first, last)) return;
   const auto count = static_cast<double>(last - first);
   double V = 0, Q = 0, P = 0; // means
   for (std::size_t i = first + 1; i <= last; ++i) {
@@ -203,7 +217,7 @@ void fit_with_intercept(const std::vector<SignalRow> &rows, std::size_t first, s
   const double E = (PV * QQ - PQ * VQ) / determinant, R = (PQ * VV - PV * VQ) / determinant;
   if (!(E > 0)) return;
   numbers.equal_weight_compliance = 1 / E;
-  if (!rows[last].flow_resistance) return; // as above
+  if (!rows[last].flow_resistance || !(R > 0)) return; // as above
   numbers.equal_weight_resistance = R * 1000;
 }
 
@@ -218,15 +232,22 @@ ClinicalNumbers clinical_numbers(const std::vector<SignalRow> &rows, std::size_t
     const SignalRow &r = rows[i], &before = rows[i - 1];
     n.peak_pressure = std::max(n.peak_pressure, r.machine_pressure());
     n.tidal_volume = std::max(n.tidal_volume, r.volume - start.volume);
+    n.fall = std::max(n.fall, start.volume - r.volume);
     n.peak_flow = std::max(n.peak_flow, r.flow);
     n.peak_expiratory_flow = std::max(n.peak_expiratory_flow, -r.flow);
     work += ((r.machine_pressure() + before.machine_pressure()) / 2 - n.peep) * (r.volume - before.volume);
   }
+  n.moves = movement(rows, first, last) > 0;
+  n.takes_in = !n.moves || n.tidal_volume > n.fall;
   add_pauses(rows, first, last, n);
   n.trapped_volume = end.volume - start.volume;
   n.driving_pressure = n.plateau_pressure.value_or(n.peak_pressure) - n.peep;
   n.dynamic_compliance = ratio(n.tidal_volume, n.peak_pressure - n.peep);
-  if (n.plateau_pressure)
+  if (!n.moves || !n.takes_in) { // ratios of V_T, and of what is left of it
+    n.dynamic_compliance.reset();
+    n.pause_resistance.reset();
+    if (!n.moves) n.static_curve_compliance.reset();
+  } else if (n.plateau_pressure)
     n.static_compliance = ratio(n.tidal_volume, *n.plateau_pressure - start.alveolar_pressure.value_or(n.peep));
   if (end.alveolar_pressure) {
     n.total_peep = *end.alveolar_pressure;
@@ -278,6 +299,7 @@ std::optional<Unsteadiness> unsteadiness(const std::vector<SignalRow> &rows)
     if (!difference || !whole || *whole == 0 || std::abs(*difference / *whole) <= largest.change) return;
     largest = {std::abs(*difference / *whole), what};
   };
+  if (!n.moves || !n.takes_in) return {};
   look_at("trapped volume over the tidal volume", n.trapped_volume, n.tidal_volume);
   if (breaths.size() > 1 && breaths[breaths.size() - 2].last == breaths.back().first) {
     const BreathRows &b = breaths[breaths.size() - 2];
@@ -290,6 +312,20 @@ std::optional<Unsteadiness> unsteadiness(const std::vector<SignalRow> &rows)
     change("change of R from the breath before", n.resistance, before.resistance);
   }
   return largest;
+}
+
+std::optional<std::size_t> shrinks_under_pressure(const std::vector<SignalRow> &rows)
+{
+  constexpr double same_pressure = 1e-6; // cmH2O
+  const auto breaths = breath_rows(rows);
+  if (breaths.empty()) return {};
+  const SignalRow &start = rows[breaths.front().first];
+  const double least = same_volume * start.rest_volume + 2 * unsettled_volume(rows).value_or(0);
+  for (std::size_t i = breaths.front().first + 1; i <= breaths.front().last; ++i) {
+    if (rows[i].machine_pressure() < start.machine_pressure() - same_pressure) return {};
+    if (rows[i].volume < start.volume - least) return i;
+  }
+  return {};
 }
 
 std::optional<double> unsettled_volume(const std::vector<SignalRow> &rows)

@@ -43,11 +43,22 @@ double EnergyAudit::worst_residual() const
   return worst;
 }
 
-double EnergyAudit::worst_share() const
+double EnergyAudit::least_work() const
 {
   constexpr double strain = 1e-6;
-  const double least = model_.modulus() * scene_.mesh().volume() * strain * strain * units::j_per_kPa_mm3;
-  return worst_residual() / std::max(rows_.back().exchanged, least);
+  return model_.modulus() * scene_.mesh().volume() * strain * strain * units::j_per_kPa_mm3;
+}
+
+double EnergyAudit::worst_share() const
+{
+  return worst_residual() / std::max(rows_.back().exchanged, least_work());
+}
+
+std::optional<double> EnergyAudit::relative_residual(const EnergyBalance &balance) const
+{
+  // without any work and residual there is nothing wrong, and 0 says so
+  if (balance.exchanged < least_work() && balance.residual != 0) return {};
+  return balance.relative_residual();
 }
 
 std::size_t EnergyAudit::account(const std::string &name, Energy kind)

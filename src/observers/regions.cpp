@@ -99,6 +99,7 @@ std::vector<SignalRow> RegionAudit::complete(std::vector<SignalRow> rows) const
   for (std::size_t i = 0; i < rows.size(); ++i) {
     if (facts.airflow) rows[i].alveolar_pressure = rows_[i].back().mean_pressure;
     rows[i].flow_resistance = facts.airflow || facts.tube;
+    rows[i].rest_volume = scene_.mesh().volume() / units::mm3_per_ml;
   }
   if (facts.ventilator && rows.back().breath > 0) {
     const double end = facts.ventilator->end_of_breath(rows.back().breath);

@@ -25,7 +25,7 @@ Json breath_json(const std::vector<SignalRow> &rows, const BreathRows &b, const 
   Json json;
   json["complete"] = b.complete;
   json["start_s"] = rows[b.first].time;
-  json["end_of_inspiration_s"] = b.complete ? Json(rows[b.fullest].time) : Json(nullptr);
+  json["end_of_inspiration_s"] = b.complete && numbers.takes_in ? Json(rows[b.fullest].time) : Json(nullptr);
   json["end_s"] = rows[b.last].time;
   for (const ClinicalEntry &e : clinical_entries(numbers, frc))
     json[e.key] = b.complete ? optional_json(e.value) : Json(nullptr);
@@ -56,7 +56,8 @@ Json energy_json(const EnergyAudit &audit, const EnergyBalance &balance)
   json["ventilator_work"] = balance.ventilator_work;
   for (std::size_t i = 0; i < balance.accounts.size(); ++i) json[audit.accounts()[i].name] = balance.accounts[i];
   json["residual"] = balance.residual;
-  json["residual_relative"] = balance.relative_residual();
+  const auto relative = audit.relative_residual(balance);
+  json["residual_relative"] = relative ? Json(*relative) : Json(nullptr);
   return json;
 }
 
@@ -183,7 +184,8 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
             return b.complete ? energy_json(*audits.energy, energy[row] - energy[b.first]) : Json(nullptr);
           };
           breath["energy_j"] = until(b.last);
-          breath["inspiratory_energy_j"] = until(b.fullest);
+          breath["inspiratory_energy_j"] =
+              clinical_numbers(rows, b.first, b.last).takes_in ? until(b.fullest) : Json(nullptr);
         }
         json["breaths"].push_back(breath);
       }

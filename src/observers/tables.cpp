@@ -10,6 +10,9 @@ namespace pulmo {
 
 namespace {
 
+/// A fit to fewer steps of a breath says more of the steps than of the lung.
+constexpr std::size_t least_steps = 10;
+
 /// The balance of the last complete breath (without one: of the run), beside that of its inspiration.
 PetscErrorCode print_energy(MPI_Comm comm, const EnergyAudit &audit, const BreathRows &breath, const char *span)
 {
@@ -45,6 +48,37 @@ PetscErrorCode print_regions(MPI_Comm comm, const RegionAudit &audit, const Brea
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+/// What numbers the last complete breath does not define, or defines badly.
+PetscErrorCode print_notes_of_breath(MPI_Comm comm, const std::vector<SignalRow> &rows)
+{
+  const auto breaths = complete_breaths(rows);
+
+  PetscFunctionBeginUser;
+  if (breaths.empty()) PetscFunctionReturn(PETSC_SUCCESS);
+  const BreathRows &last = breaths.back();
+  const ClinicalNumbers n = clinical_numbers(rows, last.first, last.last);
+  const int breath = rows[last.last].breath;
+  const std::size_t steps = last.last - last.first;
+  if (!n.moves)
+    PetscCall(PetscPrintf(comm,
+                          "pulmo: note: breath %d moves no gas (its volume changes by less than 1e-9 of the lung's): "
+                          "compliances, resistances and the time constant are null\n",
+                          breath));
+  if (!n.takes_in)
+    PetscCall(PetscPrintf(comm,
+                          "pulmo: note: in breath %d the volume falls below that of the breath's start by %.3g ml and "
+                          "rises above it by %.3g ml: tidal volume, strain and end of inspiration are not defined, and "
+                          "null; let the breath begin with the phase that fills the lung (in a programme: the word "
+                          "'breath')\n",
+                          breath, n.fall, n.tidal_volume));
+  if ((n.compliance || n.equal_weight_compliance) && steps < least_steps)
+    PetscCall(PetscPrintf(comm,
+                          "pulmo: note: C_rs and R are fitted to the %d steps of breath %d, which are too few; give a "
+                          "-ts_dt with which a breath takes %d steps or more\n",
+                          (int)steps, breath, (int)least_steps));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 /// What the clinical numbers leave out, or what they are not yet.
 PetscErrorCode print_notes(MPI_Comm comm, const Scene &scene, const std::vector<SignalRow> &rows)
 {
@@ -53,21 +87,25 @@ PetscErrorCode print_notes(MPI_Comm comm, const Scene &scene, const std::vector<
   const auto unsteady = unsteadiness(rows);
 
   PetscFunctionBeginUser;
-  if (!unsteady) PetscCall(PetscPrintf(comm, "\nNo numbers of a breath: %s.\n", why_no_numbers(scene, rows).c_str()));
+  if (complete_breaths(rows).empty())
+    PetscCall(PetscPrintf(comm, "\nNo numbers of a breath: %s.\n", why_no_numbers(scene, rows).c_str()));
   if (breaths.empty()) PetscFunctionReturn(PETSC_SUCCESS);
   const SignalRow &end = rows.back();
+  const ClinicalNumbers n = clinical_numbers(rows, breaths.back().first, breaths.back().last);
   if (end.cut)
     PetscCall(PetscPrintf(comm,
                           "pulmo: note: the run ends at t = %.6g s, within breath %d, which would end at %.6g s: that "
                           "breath has no numbers\n",
                           end.time, end.breath, (double)scene.facts().ventilator->end_of_breath(end.breath)));
-  if (unsteady && !unsteady->steady())
+  const bool driven = n.peak_pressure > n.peep || n.fall > 0; // else what changes is what came before it
+  if (unsteady && driven && !unsteady->steady())
     PetscCall(PetscPrintf(comm,
                           "pulmo: note: not a steady breath yet: %s: %.3g %% (steady: up to %.3g %%); more breaths, or "
                           "longer ones, tell whether the numbers still change\n",
                           unsteady->what.c_str(), 100 * unsteady->change, 100 * Unsteadiness::tolerated));
-  const double tidal = clinical_numbers(rows, breaths.back().first, breaths.back().last).tidal_volume;
-  if (unsettled && *unsettled > unsettled_tolerated * tidal)
+  PetscCall(print_notes_of_breath(comm, rows));
+  const double tidal = n.takes_in ? n.tidal_volume : n.fall;
+  if (unsettled && n.moves && driven && *unsettled > unsettled_tolerated * tidal)
     PetscCall(PetscPrintf(comm,
                           "pulmo: warning: the first breath starts at t = %.6g s before the lung is at rest: at least "
                           "%.3g ml are still to come, %.3g %% of the tidal volume, and count as breath; give a longer "

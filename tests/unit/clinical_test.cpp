@@ -656,5 +656,88 @@ TEST(Numbers, AreEmptyWhereABreathDoesNotDefineThem)
   EXPECT_EQ(m.tidal_volume, 0);
 }
 
+// ------------------------------------------------------------------------------------- breaths that are none
+
+/// A compartment of 80 ml/cmH2O and 4.2 cmH2O s/l whose volume follows @p V, of unit duration; lung of 2 l.
+std::vector<SignalRow> follows(const std::function<double(double)> &V, double R = 4.2e-3)
+{
+  std::vector<SignalRow> rows;
+  for (int i = 0; i <= 50; ++i) {
+    SignalRow r;
+    r.time = i / 50.;
+    r.volume = V(r.time);
+    r.dt = i == 0 ? 0 : 1 / 50.;
+    r.flow = i == 0 ? 0 : (r.volume - rows.back().volume) / r.dt;
+    r.pressure = r.volume / 80 + R * r.flow;
+    r.phase = r.time <= 0.5 ? "inspiration" : "expiration";
+    r.breath = 1;
+    r.rest_volume = 2000;
+    rows.push_back(r);
+  }
+  return rows;
+}
+
+std::optional<double> listed(const ClinicalNumbers &n, const std::string &key)
+{
+  for (const ClinicalEntry &e : clinical_entries(n, 1000))
+    if (e.key == key) return e.value;
+  ADD_FAILURE() << key;
+  return {};
+}
+
+TEST(NoBreath, WhatFallsBelowItsStartHasNoTidalVolume)
+{
+  const auto wave = [](double size) { return [=](double t) { return size * std::sin(M_PI * t); }; };
+  const ClinicalNumbers in = overall_numbers(follows(wave(400))), out = overall_numbers(follows(wave(-400)));
+  EXPECT_TRUE(in.takes_in && in.moves);
+  EXPECT_NEAR(*listed(in, "tidal_volume_ml"), 400, 1e-9);
+  EXPECT_FALSE(out.takes_in);
+  EXPECT_NEAR(out.fall, 400, 1e-9);
+  for (const char *key : {"tidal_volume_ml", "strain", "dynamic_compliance_ml_per_cmH2O"}) {
+    EXPECT_TRUE(listed(in, key)) << key;
+    EXPECT_FALSE(listed(out, key)) << key;
+  }
+  EXPECT_NEAR(*out.compliance, 80, 1e-9); // the fit does not mind
+  EXPECT_NEAR(*out.resistance, 4.2, 1e-9);
+  EXPECT_TRUE(unsteadiness(follows(wave(400))));
+  EXPECT_FALSE(unsteadiness(follows(wave(-400))));
+}
+
+TEST(NoBreath, NoResistanceIsNegative)
+{
+  const auto rows = follows([](double t) { return 400 * std::sin(M_PI * t); }, -4.2e-3);
+  const ClinicalNumbers n = overall_numbers(rows);
+  EXPECT_TRUE(n.compliance && n.equal_weight_compliance);
+  EXPECT_FALSE(n.resistance || n.time_constant || n.equal_weight_resistance);
+}
+
+TEST(NoBreath, RoundingIsNotFitted)
+{
+  const auto wave = [](double size) { return follows([=](double t) { return size * std::sin(M_PI * t); }); };
+  for (double size : {1e-13, 1e-7}) { // ml, of 2 l
+    const ClinicalNumbers n = overall_numbers(wave(size));
+    EXPECT_FALSE(n.moves) << size;
+    EXPECT_FALSE(n.compliance || n.equal_weight_compliance || n.resistance || n.equal_weight_resistance ||
+                 n.time_constant || n.dynamic_compliance)
+        << size;
+  }
+  const ClinicalNumbers n = overall_numbers(wave(1e-4));
+  EXPECT_NEAR(*n.compliance, 80, 1e-6);
+  EXPECT_NEAR(*n.equal_weight_resistance, 4.2, 1e-6);
+}
+
+TEST(NoBreath, ALungThatShrinksUnderPressureIsFound)
+{
+  const auto wave = [](double size) { return [=](double t) { return size * std::sin(M_PI * t); }; };
+  EXPECT_FALSE(shrinks_under_pressure(follows(wave(400))));
+  EXPECT_FALSE(shrinks_under_pressure(follows(wave(-400)))); // sucked out
+  auto rows = follows(wave(-400));
+  for (SignalRow &r : rows) r.pressure = -r.pressure; // pressed, and shrinks
+  ASSERT_TRUE(shrinks_under_pressure(rows));
+  EXPECT_EQ(*shrinks_under_pressure(rows), 1U);
+  for (SignalRow &r : rows) r.volume *= 1e-9; // rounding
+  EXPECT_FALSE(shrinks_under_pressure(rows));
+}
+
 } // namespace
 } // namespace pulmo::test

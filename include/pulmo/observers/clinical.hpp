@@ -34,7 +34,13 @@ struct ClinicalNumbers {
   double peak_expiratory_flow = 0;               ///< out of the lung, ml/s
   double work = 0;                               ///< closed integral of (P - PEEP) dV, J
   double mechanical_power = 0;                   ///< work times rate, J/min
+  bool moves = true;    ///< the volume changes beyond what a solver leaves; else no ratio of it means anything
+  bool takes_in = true; ///< more gas above the volume of the start than it gives below it; else V_T is not defined
+  double fall = 0;      ///< by which the volume falls below that of the start, ml
 };
+
+/// A volume below this share of the lung's is what a solver leaves of nothing.
+constexpr double least_movement = 1e-9;
 
 /// A number of a breath as it is listed.
 struct ClinicalEntry {
@@ -98,6 +104,10 @@ ClinicalNumbers overall_numbers(const std::vector<SignalRow> &rows);
 /// The overall numbers as they are listed; all values are empty if no breath is complete.
 std::vector<ClinicalEntry> overall_entries(const std::vector<SignalRow> &rows, const std::optional<double> &frc);
 
+/// The first row of the first breath at which a lung that was at rest has less volume than at the breath's start,
+/// though the pressure has not been below that of the start: no passive lung does so. Empty if there is none.
+std::optional<std::size_t> shrinks_under_pressure(const std::vector<SignalRow> &rows);
+
 /// How far the last complete breath is from a steady one.
 struct Unsteadiness {
   static constexpr double tolerated = 0.01;
@@ -108,7 +118,7 @@ struct Unsteadiness {
 };
 
 /// Looks at the trapped volume over the tidal volume and, if there is a complete breath just before it, at the changes
-/// of tidal volume, C_rs and R from that one. Empty if no breath is complete.
+/// of tidal volume, C_rs and R from that one. Empty if no breath is complete, or the last one has no V_T.
 std::optional<Unsteadiness> unsteadiness(const std::vector<SignalRow> &rows);
 
 /// More than this share of the tidal volume is told.

@@ -49,6 +49,8 @@ public:
   /// The largest residual of the run, and that as a share of what was given (a strain of a millionth at least), J.
   double worst_residual() const;
   double worst_share() const;
+  /// Of a part of the run; empty where so little work was given that rounding is as large.
+  std::optional<double> relative_residual(const EnergyBalance &balance) const;
   /// Since the start of the run, one entry per row of the signals.
   const std::vector<EnergyBalance> &rows() const { return rows_; }
 
@@ -61,6 +63,8 @@ private:
   };
 
   std::size_t account(const std::string &name, Energy kind);
+  /// Work that strains the lung by a millionth, J.
+  double least_work() const;
   /// Adds the terms of @p part to @p sums (kPa mm^3, this rank).
   PetscErrorCode integrate(const Part &part, const StepReport &step, std::vector<double> &sums);
   /// Adds the work of supports that move (this rank).

@@ -21,6 +21,7 @@ struct SignalRow {
   bool hold = false;                         ///< the phase holds the volume (prescribed flow 0)
   std::optional<double> ventilator_pressure; ///< on the machine's side of a tube, cmH2O; without one the airway's
   std::optional<double> alveolar_pressure;   ///< mean over the reference volume, cmH2O; empty without airflow
+  double rest_volume = 0;                    ///< of the lung, ml; 0: not known
   bool flow_resistance = true;               ///< something resists the flow: airflow through the tissue, or a tube
   bool cut = false;                          ///< the run ends here, before its breath does
 
