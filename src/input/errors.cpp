@@ -66,9 +66,10 @@ std::string solver_options()
   for (const auto &[name, value] : given) {
     bool solver = false;
     for (const char *begin :
-         {"-snes_", "-ksp_", "-pc_", "-mat_", "-dm_mat_", "-dm_vec_", "-fieldsplit_", "-npc_", "-sub_"})
+         {"-snes_", "-ksp_", "-pc_", "-mat_", "-dm_mat_", "-dm_vec_", "-fieldsplit_", "-npc_", "-sub_", "-ts_"})
       solver = solver || name.rfind(begin, 0) == 0;
-    if (solver && (value.empty() || ends_with(name, "_type")))
+    const bool flag = value.empty() || value == "true" || value == "on" || value == "yes" || value == "1";
+    if (solver && (flag || ends_with(name, "_type") || name.rfind("-ts_adapt", 0) == 0))
       text += (text.empty() ? "" : " ") + name + (value.empty() ? "" : " ") + value;
   }
   return text;

@@ -28,6 +28,8 @@ const std::vector<Number> &numbers()
   static const std::vector<Number> list{
       {"-ts_dt", "s", Range::between(least_step, infinity), false},
       {"-ts_max_time", "s", Range::positive(), false},
+      {"-ts_adapt_dt_min", "s", Range::not_negative(), false},
+      {"-ts_adapt_scale_solve_failed", "-", {0, 1, true}, false},
       {"-dm_refine", "-", Range::between(0, 8), true},
       {"-snes_rtol", "-", share, false},
       {"-snes_atol", "-", Range::not_negative(), false},

@@ -139,6 +139,23 @@ std::string value_of(const OptionList &list, const std::string &option, const st
   return otherwise;
 }
 
+/// Two factors, the least and the largest from one step to the next.
+PetscErrorCode check_clip(MPI_Comm comm, const std::string &value)
+{
+  char *end = nullptr;
+  const double least = std::strtod(value.c_str(), &end);
+  const bool two = end != value.c_str() && *end == ',';
+  const char *second = two ? end + 1 : end;
+  const double most = std::strtod(second, &end);
+
+  PetscFunctionBeginUser;
+  PulmoUserCheck(two && end != second && *end == '\0' && least > 0 && least <= 1 && most >= 1, comm,
+                 "option -ts_adapt_clip %s: it takes the least and the largest factor from one step to the next, the "
+                 "first above 0 and up to 1, the second 1 or more; leave it out, or give 0.1,2",
+                 value.c_str());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 } // namespace
 
 PetscErrorCode Options::check_refused(const OptionList &given) const
@@ -149,6 +166,7 @@ PetscErrorCode Options::check_refused(const OptionList &given) const
       PulmoUserCheck(!is_named(option, refusal.option, refusal.any_prefix) || is_allowed(refusal, value), comm_,
                      "option %s%s%s does not go with pulmo: %s", option.c_str(), value.empty() ? "" : " ",
                      value.c_str(), refusal.why);
+  PetscCall(check_clip(comm_, value_of(given, "-ts_adapt_clip", "0.1,2")));
   const std::string newton = value_of(given, "-snes_type", "newtonls"),
                     inner = value_of(given, "-npc_snes_type", "none"), krylov = value_of(given, "-ksp_type", "gmres"),
                     pc = value_of(given, "-pc_type", "lu");
@@ -168,6 +186,10 @@ PetscErrorCode Options::check_refused(const OptionList &given) const
                  "option -ksp_type preonly applies -pc_type %s once, which solves no linear system; use -ksp_type "
                  "fgmres, or -pc_type lu",
                  pc.c_str());
+  const std::string guess = value_of(given, "-ksp_initial_guess_nonzero", "off");
+  PulmoUserCheck(krylov != "preonly" || is_allowed({"", false, off, ""}, guess), comm_,
+                 "option -ksp_initial_guess_nonzero does not go with -ksp_type preonly, which starts from nothing; "
+                 "leave it out, or use -ksp_type fgmres");
   const std::string matrix_free = value_of(given, "-snes_mf", "off");
   PulmoUserCheck(krylov != "preonly" || matrix_free == "off" || matrix_free == "false" || matrix_free == "0", comm_,
                  "option -snes_mf leaves no matrix to factorise; use -snes_mf_operator, or a Krylov method (-ksp_type "

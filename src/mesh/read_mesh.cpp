@@ -161,7 +161,15 @@ PetscErrorCode read_mesh_file(const std::string &file, MeshFile &mesh, std::stri
   } else if (is_msh(file)) {
     std::ostringstream content;
     content << in.rdbuf();
-    fault = read_msh(content.str(), mesh);
+    const std::string text = content.str();
+    fault = read_msh(text, mesh);
+    const auto periodic = text.find("$Periodic");
+    if (fault.empty() && periodic != std::string::npos && periodic > 0 &&
+        (text[periodic - 1] == '\n' || text[periodic - 1] == '\r'))
+      PetscCall(PetscPrintf(PETSC_COMM_SELF,
+                            "pulmo: note: mesh %s ties surfaces to one another ($Periodic); pulmo does not: each of "
+                            "them moves by itself\n",
+                            file.c_str()));
   } else {
     PetscCall(read_other(file, mesh, fault));
   }

@@ -245,6 +245,11 @@ PetscErrorCode Simulation::create_solver()
   PulmoUserCheck(!limits_steps || step_control_.in_use(), comm,
                  "-ts_adapt_dt_max: steps do not grow beyond -ts_dt unless their error chooses them; lower -ts_dt, or "
                  "give -step_volume_tolerance and -step_pressure_tolerance");
+  if (adapt->dt_min > wanted_dt_)
+    PetscCall(PetscPrintf(comm,
+                          "pulmo: warning: -ts_adapt_dt_min %g s is longer than -ts_dt %g s: no step can be cut, and "
+                          "the first one that fails ends the run; lower it\n",
+                          (double)adapt->dt_min, (double)wanted_dt_));
   PetscCall(scheme_.setup(ts_, local_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
