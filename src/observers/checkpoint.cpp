@@ -123,7 +123,25 @@ PetscErrorCode Checkpoint::observe(const StepReport &step)
 
   PetscFunctionBeginUser;
   const bool end = every_ > 0 && step.phase_ends && step.row.time > step.end - 1e-9 * every_;
-  if (!schedule_->due(step.row.time) && !end) PetscFunctionReturn(PETSC_SUCCESS);
+  const bool begins = step.rows.size() == 1, cuts = every_ > 0 && step.end_cuts_next && !cut_from_;
+  bool due = schedule_->due(step.row.time) || end;
+  // an uninterrupted run goes through the state before a step that -ts_max_time cuts, but not through those after it
+  if (cut_from_) due = end && *cut_from_ == 0;
+  if (cuts) {
+    cut_from_ = step.row.time;
+    due = !begins;
+  }
+  if (!due) PetscFunctionReturn(PETSC_SUCCESS);
+  if (cuts)
+    PetscCall(PetscPrintf(options_.comm(),
+                          "pulmo: note: -ts_max_time %.6g cuts the last step: the checkpoint is of t = %.6g s, from "
+                          "where a longer run goes on as if it had never stopped\n",
+                          (double)step.end, (double)step.row.time));
+  else if (cut_from_)
+    PetscCall(PetscPrintf(options_.comm(),
+                          "pulmo: note: -ts_max_time %.6g cuts the first step: a run that goes on from this checkpoint "
+                          "keeps it, and an uninterrupted one does not take it\n",
+                          (double)step.end));
   PetscCall(write(complaint));
   PulmoFailureCheck(complaint.empty(), options_.comm(), "%s", complaint.c_str());
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -174,6 +192,7 @@ PetscErrorCode Checkpoint::restore()
   PetscCall(simulation_.persist(*archive));
   PetscCall(persist_numerics(*archive));
   schedule_->skip(simulation_.time());
+  if (simulation_.end_cuts_next()) cut_from_ = simulation_.time(); // this file is the one to go on from, once more
   spare_previous_ = fs::path(restart_).filename() == "checkpoint_previous.h5";
   PetscCall(
       PetscPrintf(options_.comm(), "going on from %s at t = %.6g s\n", restart_.c_str(), (double)simulation_.time()));

@@ -89,6 +89,7 @@ PetscErrorCode Simulation::setup()
   PetscCall(create_solver());
   phases_ = phases();
   end_ = phases_.back().end;
+  whole_end_ = scene_.facts().ventilator ? scene_.facts().ventilator->phases()[phases_.size() - 1].end : PETSC_MAX_REAL;
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -116,11 +117,41 @@ bool Simulation::same(PetscReal t, PetscReal other) const
   return std::abs(t - other) <= same_time * asked_dt();
 }
 
+/// The size of the step from time t within a phase that ends at @p end, where steps of @p dt are wanted.
+PetscReal Simulation::landing(const Phase &phase, PetscReal end, PetscReal dt, PetscReal t) const
+{
+  for (const PetscReal stop : {phase.begin + phase.ramp, end})
+    if (t < stop && !same(t, stop) && t + (1 + stretch) * dt > stop) return stop - t;
+  return dt;
+}
+
 PetscReal Simulation::landing(PetscReal t) const
 {
-  for (const PetscReal stop : {phase_->begin + phase_->ramp, phase_->end})
-    if (t < stop && !same(t, stop) && t + (1 + stretch) * dt_ > stop) return stop - t;
-  return dt_;
+  return landing(*phase_, phase_->end, dt_, t);
+}
+
+PetscReal Simulation::goes_on_with(const Phase &phase, PetscReal end, PetscReal dt, PetscReal t) const
+{
+  const PetscReal h = landing(phase, end, dt, t), left = end - t;
+  TSAdapt adapt;
+  (void)TSGetAdapt(ts_, &adapt);
+  if (h >= left || h * (1 + adapt->matchstepfac[0]) > left) return left;
+  return h * adapt->matchstepfac[1] > left ? left / 2 : h;
+}
+
+bool Simulation::end_cuts_next() const
+{
+  const PetscReal t = accepted_.time;
+  const Phase &last = phases_.back(), *next = phase_ ? phase_ : &phases_.front();
+  if (same(end_, whole_end_) || same(t, end_)) return false;
+  const bool begins = !phase_ || same(t, phase_->end);
+  if (phase_ && begins) ++next; // the run goes on, so there is one
+  if (next != &last) return false;
+  const PetscReal asked = last.dt.value_or(wanted_dt_); // what run() begins a phase with
+  const PetscReal dt = begins && (step_control_.in_use() || asked != asked_dt()) ? asked : dt_;
+  const PetscReal now = begins ? landing(last, end_, dt, t) : goes_on_with(last, end_, dt, t),
+                  whole = begins ? landing(last, whole_end_, dt, t) : goes_on_with(last, whole_end_, dt, t);
+  return !same(now, whole);
 }
 
 PetscReal Simulation::next_step(PetscReal t, PetscReal h, TSAdapt adapt, PetscBool &accept)
@@ -171,8 +202,8 @@ PetscErrorCode Simulation::start()
   accepted_.ventilator_pressure = accepted_.pressure;
   PetscCall(scheme_.begin(model_, 0, measures.volume_change, before_));
   PetscCall(warn_of_low_limits());
-  PetscCall(report(accepted_, measures));
   dt_ = asked_dt();
+  PetscCall(report(accepted_, measures));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -703,7 +734,8 @@ PetscErrorCode Simulation::after_step()
   if (scene_.facts().airflow) PetscCall(consistent_flow(flow));
   row.flow = flow / units::mm3_per_ml;
   PetscCall(VecCopy(local_, before_));
-  const bool kink = (same(t, phase_->begin + phase_->ramp) || airway_.reaches_limit()) && !same(t, phase_->end);
+  const bool phase_goes_on = !same(t, phase_ == &phases_.back() ? whole_end_ : phase_->end); // perhaps after a restart
+  const bool kink = (same(t, phase_->begin + phase_->ramp) || airway_.reaches_limit()) && phase_goes_on;
   airway_.accept(row.flow * units::mm3_per_ml);
   row.time = t;
   row.pressure = pressure / units::kPa_per_cmH2O;
@@ -756,7 +788,7 @@ PetscErrorCode Simulation::report(const SignalRow &row, const Measures &measures
   worst_balance_ = std::max(worst_balance_, std::abs(balance));
   min_J_ = std::min(min_J_, measures.min_J);
   const bool phase_ends = phase_ && same(row.time, phase_->end);
-  const StepReport step{rows_, row, measures, balance, before_, local_residual_, end_, phase_ends};
+  const StepReport step{rows_, row, measures, balance, before_, local_residual_, end_, phase_ends, end_cuts_next()};
   for (Observer *observer : observers_) PetscCall(observer->observe(step));
   PetscFunctionReturn(PETSC_SUCCESS);
 }

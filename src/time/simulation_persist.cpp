@@ -144,7 +144,7 @@ PetscErrorCode Simulation::resume(const Archive &archive, PetscInt index, PetscR
   airway_.begin_phase(*phase_, 0, 0);
   const bool new_dt = (!phase_->dt && wanted_dt != wanted_dt_) || (!step_control_.in_use() && dt_ > asked_dt());
   if (new_dt) dt_ = asked_dt();
-  if (new_dt || phase_end != phase_->end) next_dt_ = landing(accepted_.time);
+  if (new_dt || phase_end != phase_->end) next_dt_ = goes_on_with(*phase_, phase_->end, dt_, accepted_.time);
   resumed_ = true;
   PetscFunctionReturn(PETSC_SUCCESS);
 }

@@ -265,6 +265,53 @@ class Agreement(RestartCase):
         self.assertIn("earlier snapshots are not in", rest.out)
         self.assertEqual(self.index(rest), [t for t in (0.6, 0.7) if t > checkpoint_time(alone) + 1e-9])
 
+    def test_an_end_between_steps(self):
+        """-ts_max_time cuts the last step: the checkpoint is of the state before, and a longer run never took that step."""
+        scenes = {
+            # 0.23 s: within a phase, the last two steps are halves; 0.33 s: within its first step; 0.1 s: a step ends
+            # there; 0.1003 s: it is stretched
+            "pcv": (PCV, [(0.23, 0.15), (0.33, 0.3), (0.1, 0.1), (0.1003, 0.05)]),
+            # two steps of 0.04 s end the phase from 0.32 s on
+            "halves": (PCV[:-1] + ["0.28"], [(0.51, 0.45), (0.56, 0.5)]),
+            # 0.02 s: the end of the ramp
+            "steps by their error": (CUBE + TWICE + ["-ts_type", "bdf", "-ts_dt", "0.01", "-step_volume_tolerance", "0.5",
+                                                     "-ventilator_ramp", "0.02"], [(0.02, 0.02), (0.123, None)]),
+        }
+        for scene, (options, ends) in scenes.items():
+            reference = pulmo.finished(options)
+            times = reference.signals()["time_s"]
+            for end, kept in ends:
+                with self.subTest(scene, end=end):
+                    short = pulmo.finished(options + ["-ts_max_time", end, "-checkpoint_every", "10"])
+                    self.assertAlmostEqual(short.signals()["time_s"][-1], end, 12)
+                    at = checkpoint_time(short.path("checkpoint.h5"))
+                    if kept is None:
+                        self.assertLess(np.abs(times - at).min(), 1e-9)
+                    else:
+                        self.assertAlmostEqual(at, kept, 9)
+                    self.assertEqual("pulmo: note: -ts_max_time" in short.out, at < end - 1e-9)
+                    restart = ["-restart", short.path("checkpoint.h5")]
+                    self.expect_same(reference, pulmo.finished(options + restart), SAME_RANKS)
+                    self.expect_same(reference, pulmo.finished(options + restart + ["-output_overwrite"], directory=short.directory),
+                                     SAME_RANKS)
+
+    def test_an_end_within_the_first_step(self):
+        short = pulmo.finished(PCV + ["-ts_max_time", "0.02", "-checkpoint_every", "10"])
+        self.assertIn("pulmo: note: -ts_max_time 0.02 cuts the first step", short.out)
+        rest = pulmo.finished(PCV + ["-restart", short.path("checkpoint.h5")]).signals()["time_s"]
+        np.testing.assert_allclose(rest[:3], [0, 0.02, 0.07], atol=1e-12)
+
+    def test_an_end_between_steps_twice(self):
+        """Nothing is kept of a step that is cut again."""
+        reference = pulmo.finished(PCV)
+        short = pulmo.finished(PCV + ["-ts_max_time", "0.33", "-checkpoint_every", "0.01"])
+        before = checkpoint_time(short.path("checkpoint.h5"))
+        again = pulmo.finished(PCV + ["-ts_max_time", "0.34", "-checkpoint_every", "0.01", "-output_overwrite", "-restart",
+                                      short.path("checkpoint.h5")], directory=short.directory)
+        self.assertEqual(checkpoint_time(short.path("checkpoint.h5")), before)
+        self.assertAlmostEqual(again.signals()["time_s"][-1], 0.34, 12)
+        self.expect_same(reference, pulmo.finished(PCV + ["-restart", short.path("checkpoint.h5")]), SAME_RANKS)
+
     def test_later_phases_may_change(self):
         first = "in 0.2 pressure 5\nout 0.2 pressure 0\n"
         other = CUBE + pulmo.programme(first + "in 0.2 pressure 3\n")

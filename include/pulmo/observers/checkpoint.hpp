@@ -54,7 +54,8 @@ private:
   PetscReal every_ = 0;
   std::string restart_, numerics_changed_;
   std::optional<Schedule> schedule_;
-  bool spare_previous_ = false; ///< the run came from checkpoint_previous.h5: the one after it may be bad
+  std::optional<PetscReal> cut_from_; ///< the steps after this time are other ones because the run ends, s
+  bool spare_previous_ = false;       ///< the run came from checkpoint_previous.h5: the one after it may be bad
 };
 
 } // namespace pulmo

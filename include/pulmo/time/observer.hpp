@@ -20,6 +20,7 @@ struct StepReport {
   Vec residual;                 ///< local, rows scaled; not of the row at the start
   PetscReal end;                ///< when the run ends, s
   bool phase_ends;              ///< this row is the last of its phase
+  bool end_cuts_next;           ///< the next step would be another one if the run did not end at -ts_max_time
 };
 
 /// Watches a run and never steers it.

@@ -61,6 +61,8 @@ public:
   const StepControl &step_control() const { return step_control_; }
   PetscReal wanted_dt() const { return wanted_dt_; } ///< -ts_dt, s
   TS ts() const { return ts_; }
+  /// Whether the step after the last accepted one would be another one if the run did not end at -ts_max_time.
+  bool end_cuts_next() const;
   /// Makes failure_text() say that @p what, as the solver leaves @p left, and which options made it so.
   PetscErrorCode end_unsolved(const std::string &what, const std::string &left);
   /// One paragraph on a run that could not go on: where, when, what was tried, what to try.
@@ -127,6 +129,10 @@ private:
                         bool inverted);
   PetscErrorCode report(const SignalRow &row, const Measures &measures);
   std::vector<Phase> phases() const;
+  PetscReal landing(const Phase &phase, PetscReal end, PetscReal dt, PetscReal t) const;
+  /// The same as PETSc changes it for all steps of a phase but the first (TSAdaptChoose), so that none before the end
+  /// is a sliver.
+  PetscReal goes_on_with(const Phase &phase, PetscReal end, PetscReal dt, PetscReal t) const;
 
   const Options &options_;
   const Scene &scene_;
@@ -152,7 +158,7 @@ private:
   const Phase *phase_ = nullptr;
   PetscReal wanted_dt_ = 0.05, dt_ = 0.05; ///< -ts_dt; in use before any shortening to land on a time
   PetscReal next_dt_ = 0;                  ///< size of the step after the last accepted one, before any cut
-  PetscReal end_ = 0;
+  PetscReal end_ = 0, whole_end_ = 0;      ///< of the run; of its last phase but for -ts_max_time
   SignalRow accepted_;
   std::vector<SignalRow> rows_;
   PetscReal delivered_ = 0, worst_balance_ = 0, worst_reaction_ = 0, min_J_ = 1;
