@@ -111,6 +111,16 @@ bool read_at_end(const std::string &option)
   return list.count(option) > 0;
 }
 
+/// Options of pulmo's that moved, and where to.
+struct Renamed {
+  const char *before;
+  struct {
+    const char *name, *why;
+  } now;
+};
+constexpr Renamed renamed[] = {
+    {"-airflow_porosity", {"-tissue_porosity", "it belongs to the tissue, whether air flows or not"}}};
+
 /// Options that a solver reads when it has gone through a phase.
 bool read_after_steps(const std::string &option)
 {
@@ -617,6 +627,9 @@ PetscErrorCode Options::check_unknown() const
     PulmoUserCheck(!off, comm_,
                    "option %s (%s) has no effect in this scene, for %s is off (%s); leave it out, or leave out %s off",
                    name.c_str(), source(name).c_str(), effect.c_str(), source(effect).c_str(), effect.c_str());
+    for (const auto &[before, now] : renamed)
+      PulmoUserCheck(name != before, comm_, "option %s is called %s now: %s; give %s %s", name.c_str(), now.name,
+                     now.why, now.name, value.c_str());
     PulmoUserCheck(!idle, comm_, "option %s has no effect in this scene: it needs %s", name.c_str(),
                    groups_[idle->group].enabled_by.c_str());
     for (const Group &group : groups_) {

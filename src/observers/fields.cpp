@@ -407,7 +407,7 @@ PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
         std::min_element(states.begin(), states.end(), [](const auto &a, const auto &b) { return a.J < b.J; })->J);
     hydrostatic.push_back(mean_h);
     von_mises.push_back(mean_m);
-    if (gas) porosity.push_back(1 - (1 - scene_.airflow().porosity()) / mean_J);
+    if (gas) porosity.push_back(constants::get<Porosity>(constants).at(mean_J));
   }
   if (breath_start_) {
     const ReadArray start(breath_start_);

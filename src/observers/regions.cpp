@@ -21,6 +21,9 @@ PetscErrorCode RegionAudit::setup()
 {
   const MPI_Comm comm = PetscObjectComm((PetscObject)model_.dm());
 
+  const PetscReal everywhere = scene_.tissue().porosity().reference;
+  double others = 0; // what parts with a porosity of their own have more, mm^3
+
   PetscFunctionBeginUser;
   PetscCall(scene_.mesh().regions(regions_));
   const std::size_t whole = regions_.size();
@@ -31,10 +34,51 @@ PetscErrorCode RegionAudit::setup()
   for (std::size_t c = 0; c < regions_of_.size(); ++c) {
     regions_of_[c].push_back(whole);
     for (std::size_t r : regions_of_[c]) volumes_[r] += sampling_.cells()[c].measure / units::mm3_per_ml;
+    if (scene_.tissue().porosity_varies())
+      others += (porosity(static_cast<PetscInt>(c)).reference - everywhere) * sampling_.cells()[c].measure;
   }
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &others, 1, MPI_DOUBLE, MPI_SUM, comm));
+  air_ = everywhere * scene_.mesh().volume() / units::mm3_per_ml + others / units::mm3_per_ml;
   PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, volumes_.data(), static_cast<PetscMPIInt>(volumes_.size()), MPI_DOUBLE,
                              MPI_SUM, comm));
   PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+Porosity RegionAudit::porosity(PetscInt cell) const
+{
+  return constants::get<Porosity>(model_.constants_at(cell));
+}
+
+std::optional<double> RegionAudit::functional_residual_capacity() const
+{
+  return scene_.facts().airflow ? std::optional<double>(air_) : std::nullopt;
+}
+
+/// Appends the least porosity over points and corners of all cells, each with its own Phi0.
+PetscErrorCode RegionAudit::follow_porosity(Vec local)
+{
+  const Assembly &assembly = model_.assembly();
+  std::vector<PointState> states;
+  double least = 1;
+
+  PetscFunctionBeginUser;
+  const ReadArray x(local);
+  for (PetscInt c = 0; c < assembly.cells(); ++c) {
+    const Porosity own = porosity(c);
+    assembly.point_states(c, x.data(), states);
+    for (const PointState &s : states) least = std::min<double>(least, own.at(s.J));
+  }
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &least, 1, MPI_DOUBLE, MPI_MIN, PetscObjectComm((PetscObject)model_.dm())));
+  least_porosity_.push_back(least);
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+std::vector<double> RegionAudit::least_porosity(const std::vector<SignalRow> &rows) const
+{
+  if (scene_.tissue().porosity_varies()) return least_porosity_;
+  std::vector<double> list;
+  for (const SignalRow &row : rows) list.push_back(scene_.tissue().porosity().at(row.min_J));
+  return list;
 }
 
 PetscErrorCode RegionAudit::observe(const StepReport &step)
@@ -79,6 +123,7 @@ PetscErrorCode RegionAudit::observe(const StepReport &step)
     states[r].sd_pressure = spread(sum[p1], sum[p2]) / units::kPa_per_cmH2O;
   }
   rows_.push_back(std::move(states));
+  if (gas && scene_.tissue().porosity_varies()) PetscCall(follow_porosity(step.local));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -90,6 +135,8 @@ PetscErrorCode RegionAudit::persist(Archive &archive, Vec)
   PetscCall(archive.table("regions", rows_, empty, [](std::vector<RegionState> &row, Cells &cells) {
     for (RegionState &s : row) cells(s.volume_change, s.mean_J, s.sd_J, s.mean_pressure, s.sd_pressure);
   }));
+  if (scene_.facts().airflow && scene_.tissue().porosity_varies())
+    PetscCall(archive.table("least_porosity", least_porosity_, 0.0, [](double &row, Cells &cells) { cells(row); }));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

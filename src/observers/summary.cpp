@@ -5,6 +5,7 @@
 
 #include <nlohmann/json.hpp>
 
+#include <algorithm>
 #include <fstream>
 
 namespace pulmo {
@@ -163,7 +164,7 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
     json["finished"] = finished;
     if (!finished) json["failure"] = simulation.failure_text();
     if (!finished) json["diagnosis"] = diagnosis_json(simulation.diagnosis());
-    const auto frc = scene.functional_residual_capacity();
+    const auto frc = audits.regions.functional_residual_capacity();
     const std::vector<SignalRow> rows = audits.regions.complete(simulation.rows());
     if (scene.facts().ventilator) {
       const auto complete = complete_breaths(rows);
@@ -211,7 +212,10 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
       json["support_reaction_n"] = simulation.support_reaction() * units::newton_per_kPa_mm2;
     if (model.composition().pinned()) json["pin_force_n"] = simulation.pins().largest() * units::newton_per_kPa_mm2;
     json["min_jacobian"] = simulation.min_J();
-    if (scene.facts().airflow) json["min_porosity"] = 1 - (1 - scene.airflow().porosity()) / simulation.min_J();
+    if (scene.facts().airflow) {
+      const std::vector<double> least = audits.regions.least_porosity(simulation.rows());
+      json["min_porosity"] = *std::min_element(least.begin(), least.end());
+    }
     json["end_time_s"] = simulation.time();
     json["steps"] = simulation.rows().size() - 1;
     json["rejected_steps"] = simulation.rejected_steps();

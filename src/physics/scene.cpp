@@ -1,7 +1,5 @@
 #include "pulmo/physics/scene.hpp"
 
-#include "pulmo/base/units.hpp"
-
 namespace pulmo {
 
 Scene::Scene(const Registry &registry)
@@ -74,12 +72,6 @@ PetscErrorCode Scene::compose(Composition &composition) const
     PetscCall(effect->terms(composition, facts_));
   }
   PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-std::optional<double> Scene::functional_residual_capacity() const
-{
-  if (!facts_.airflow) return std::nullopt;
-  return airflow_->porosity() * mesh_.volume() / units::mm3_per_ml;
 }
 
 std::vector<const Effect *> Scene::active() const

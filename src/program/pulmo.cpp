@@ -96,21 +96,24 @@ PetscErrorCode note_no_breath(MPI_Comm comm, const Scene &scene)
 
 /// Says when the run first left the range of the model: below J = 1 - Phi0 the porosity is negative, and no tissue law
 /// but berger keeps J from it.
-PetscErrorCode warn_of_no_air(MPI_Comm comm, const Scene &scene, const Simulation &simulation)
+PetscErrorCode warn_of_no_air(MPI_Comm comm, const Options &options, const Scene &scene, const Simulation &simulation,
+                              const RegionAudit &regions)
 {
   PetscFunctionBeginUser;
   if (!scene.facts().airflow) PetscFunctionReturn(PETSC_SUCCESS);
-  const PetscReal least = 1 - scene.airflow().porosity();
-  for (const SignalRow &row : simulation.rows()) {
-    if (row.min_J >= least) continue;
-    PetscCall(
-        PetscPrintf(comm,
-                    "pulmo: warning: at t = %g s the porosity falls below zero: J = %g is less than 1 - Phi0 = %g "
-                    "(-airflow_porosity %g), so that there would be less than no air; from there on the numbers mean "
-                    "nothing. What to try: less suction, -tissue berger, a larger -airflow_porosity\n",
-                    (double)row.time, (double)row.min_J, (double)least, (double)scene.airflow().porosity()));
-    break;
-  }
+  const std::vector<double> porosity = regions.least_porosity(simulation.rows());
+  const auto first = std::find_if(porosity.begin(), porosity.end(), [](double least) { return least < 0; });
+  if (first == porosity.end()) PetscFunctionReturn(PETSC_SUCCESS);
+  std::string given;
+  for (const auto &[name, value] : options.own_used())
+    if (name == "-tissue_porosity") given = value;
+  PetscCall(
+      PetscPrintf(comm,
+                  "pulmo: warning: at t = %g s the porosity falls below zero: J is less than 1 - Phi0 (least J %g, "
+                  "-tissue_porosity %s), so that there would be less than no air; from there on the numbers mean "
+                  "nothing. What to try: less suction, -tissue berger, a larger -tissue_porosity\n",
+                  (double)simulation.rows()[first - porosity.begin()].time,
+                  (double)simulation.rows()[first - porosity.begin()].min_J, given.c_str()));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -491,7 +494,7 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   }
   if (finished && audit_energy) PetscCall(hold_energy(comm, energy, run.model(), simulation, finished));
   PetscCall(options.warn_unused(scene.facts().airflow, true));
-  PetscCall(warn_of_no_air(comm, scene, simulation));
+  PetscCall(warn_of_no_air(comm, options, scene, simulation, regions));
   if (!scene.facts().settling.off || run.settle_note().empty()) // else loads that act at rest are told already
     PetscCall(warn_of_shrinking(comm, simulation, regions));
   PetscCall(simulation.pins().warn(run.model()));

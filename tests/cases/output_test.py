@@ -510,7 +510,7 @@ class Help(unittest.TestCase):
         "-tissue": None, "-tissue_mu": "kPa", "-tissue_lambda": "kPa", "-tissue_phi0": "-",
         "-tissue_a": "-", "-tissue_b": "-", "-tissue_c": "kPa", "-tissue_beta": "-", "-tissue_c1": "kPa",
         "-tissue_c3": "kPa", "-tissue_d1": "-", "-tissue_d3": "-", "-tissue_c_q": "kPa", "-tissue_c_c": "kPa",
-        "-tissue_kappa": "kPa", "-airflow": "on/off", "-airflow_permeability": "mm^2/(kPa s)", "-airflow_porosity": "-",
+        "-tissue_kappa": "kPa", "-airflow": "on/off", "-airflow_permeability": "mm^2/(kPa s)", "-tissue_porosity": "-",
         "-airflow_surfaces": None, "-chest_wall": "on/off", "-chest_wall_surfaces": None,
         "-chest_wall_stiffness": "kPa/mm", "-chest_wall_stiffness_pleura": "kPa/mm",
         "-chest_wall_stiffness_airway": "kPa/mm", "-chest_wall_direction": None, "-ventilator": None,

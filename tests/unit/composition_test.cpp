@@ -35,6 +35,7 @@ struct Expected {
       g[1][0][3] += 1;
       g[1][1][3] += 1;
       owners.insert("permeability");
+      owners.insert("porosity"); // for fields and summary
     }
     if (s.ventilator && !s.airflow) { // uniform gas
       f[0][1] += 1;

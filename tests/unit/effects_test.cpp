@@ -315,6 +315,9 @@ TEST(Constants, EveryOwnerFindsItsOwnBlock)
   EXPECT_EQ(constants::get<A>(c).two, 2);
   EXPECT_EQ(constants::get<B>(c).three, 3);
   EXPECT_EQ(constants::get<C>(c).absent, 0);
+  const auto both = constants::get<Both<B, A>>(c);
+  EXPECT_EQ(both.own.three, 3);
+  EXPECT_EQ(both.other.two, 2);
   // the names in use have tags of their own, exact in a double
   const char *owners[] = {"step",     "tissue",     "permeability", "chest_wall",
                           "traction", "ventilator", "airflow",      "support"};

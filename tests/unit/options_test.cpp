@@ -269,7 +269,7 @@ TEST(SceneOptions, MistakesNameTheMend)
   EXPECT_HAS(scene_error("-ventilator pcv -ventilator_pip 3 -ventilator_peep 5"), "raise pip or lower peep");
   EXPECT_HAS(scene_error("-ventilator pcv -ventilator_breaths 0"), "out of range");
   EXPECT_HAS(scene_error("-airflow -airflow_surfaces x1 -airflow_permeability 0"), "> 0");
-  EXPECT_HAS(scene_error("-airflow -airflow_surfaces x1 -airflow_porosity 1"), "0 < value < 1");
+  EXPECT_HAS(scene_error("-airflow -airflow_surfaces x1 -tissue_porosity 1"), "0 < value < 1");
   EXPECT_HAS(scene_error("-quadrature_degree 9"), "out of range");
 }
 

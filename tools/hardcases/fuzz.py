@@ -64,7 +64,7 @@ def scene(dice):
         if dice.random() < 0.5:
             options.append("-lumen_pressure")
         if dice.random() < 0.2:
-            options += ["-airflow_porosity", dice.choice([0.5, 0.8, 0.95])]
+            options += ["-tissue_porosity", dice.choice([0.5, 0.8, 0.95])]
     # gas on the airway's wall pushes the lung as a whole: springs have to carry that, and within the lung's own length; free
     # CM5 has no shear stiffness in any state
     pushed = "-lumen_pressure" in options

@@ -64,7 +64,7 @@ def suction(lab):
     J = inflated("yoshihara", -20, 1e-3, 1)
     for porosity, alarm in ((0.3, False), (0.2, True)):
         run = lab.finished(pulmo.DIRECT + pulmo.PAPER + pulmo.PINS + pulmo.BLOCK + [
-            "-tissue", "yoshihara", "-airflow", "-airflow_surfaces", "x1", "-airflow_permeability", 1e8, "-airflow_porosity", porosity] +
+            "-tissue", "yoshihara", "-airflow", "-airflow_surfaces", "x1", "-airflow_permeability", 1e8, "-tissue_porosity", porosity] +
             pulmo.programme("suction 1 pressure -20 ramp 0.5"), f"Φ0 = {porosity}")
         if run:
             lab.within(f"least porosity, Φ0 = {porosity}", run.json().get("min_porosity", np.nan), 1 - (1 - porosity) / J, 1e-4)

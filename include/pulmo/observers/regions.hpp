@@ -44,13 +44,23 @@ public:
   /// The clinical numbers of a run with these signals.
   std::vector<ClinicalEntry> numbers(const std::vector<SignalRow> &rows) const
   {
-    return overall_entries(complete(rows), scene_.functional_residual_capacity());
+    return overall_entries(complete(rows), functional_residual_capacity());
   }
+  /// Gas volume at rest int Phi0, ml; empty without airflow.
+  std::optional<double> functional_residual_capacity() const;
+  /// The least porosity anywhere in the lung at each row of the signals; needs airflow.
+  std::vector<double> least_porosity(const std::vector<SignalRow> &rows) const;
 
 private:
+  /// The porosity at rest of a cell.
+  Porosity porosity(PetscInt cell) const;
+  PetscErrorCode follow_porosity(Vec local);
+
   const Scene &scene_;
   const Model &model_;
   const Sampling &sampling_;
+  double air_ = 0;                     ///< ml, at rest
+  std::vector<double> least_porosity_; ///< [row], where parts of the lung have porosities of their own
   std::vector<Mesh::Region> regions_;
   std::vector<std::vector<std::size_t>> regions_of_; ///< [cell]; the last entry of a row stands for the whole lung
   std::vector<double> volumes_;

@@ -11,6 +11,7 @@
 #include "pulmo/physics/tissue_law.hpp"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <functional>
 #include <memory>
@@ -205,7 +206,7 @@ public:
   void energy(Energy kind, const std::string &account, const std::string &surface, Callback<EnergyDensity> density)
   {
     energies_.push_back({effect_, kind, account, surface, density.function});
-    if (density.owner) readers_.push_back({effect_, account, surface, density.owner});
+    note_readers(effect_, account, surface, density.owners);
   }
   /// Lets an effect remember quantities at the points of the cells. @p value computes all of them from a state, of
   /// which the effect sees those before in Point::memory and Point::past(); it is called once for an accepted step, and
@@ -213,8 +214,8 @@ public:
   void remember(std::vector<Quantity> quantities, Callback<MemoryFunction> value)
   {
     const PetscInt offset = memory_width();
-    memories_.push_back({effect_, value.owner, std::move(quantities), value.function, offset});
-    readers_.push_back({effect_, "memory", "", value.owner});
+    memories_.push_back({effect_, value.owners[0], std::move(quantities), value.function, offset});
+    note_readers(effect_, "memory", "", value.owners);
   }
   const std::vector<MemorySpec> &memories() const { return memories_; }
   /// Scalars that are remembered at a point.
@@ -305,11 +306,18 @@ private:
   {
     const auto fill = [&](const auto &slot) {
       slot.put(t);
-      if (slot.callback.owner) readers_.push_back({t.effect, t.name, t.surface, slot.callback.owner});
+      note_readers(t.effect, t.name, t.surface, slot.callback.owners);
     };
     static_assert(sizeof...(Slots) > 0, "a term needs a callback: f0(...), f1(...), g0(...) ... g3(...)");
     (fill(slots), ...);
     terms_.push_back(std::move(t));
+  }
+
+  void note_readers(const std::string &effect, const std::string &term, const std::string &surface,
+                    const std::array<const char *, 2> &owners)
+  {
+    for (const char *owner : owners)
+      if (owner) readers_.push_back({effect, term, surface, owner});
   }
 
   /// What reads a block of parameters.
@@ -360,6 +368,7 @@ struct SceneFacts {
   Elements elements;
   const TissueLaw *law = nullptr;              ///< of the tissue
   bool airflow = false;                        ///< the pressure field exists
+  bool porosity = false;                       ///< a kernel or an observer reads the tissue's porosity (Porosity)
   std::vector<std::string> airway_surfaces;    ///< open to the ventilator; without airflow those that would be
   std::shared_ptr<const Programme> ventilator; ///< null without a ventilator
   Settling settling;

@@ -13,6 +13,7 @@
 #include "pulmo/base/petsc.hpp"
 #include "pulmo/physics/kinematics.hpp"
 
+#include <array>
 #include <cstdint>
 #include <cstring>
 #include <string_view>
@@ -22,6 +23,29 @@ namespace pulmo {
 
 /// Order of the fields that pulmo's kernels know. Displacement is always there, pressure only with airflow.
 enum FieldIndex : PetscInt { displacement = 0, pressure = 1 };
+
+/// The parameters of a kernel that reads two blocks, e.g. its own and those of the tissue: Both<Mine, Porosity>.
+template <class A, class B>
+struct Both {
+  A own;
+  B other;
+};
+template <class P>
+constexpr bool is_both = false;
+template <class A, class B>
+constexpr bool is_both<Both<A, B>> = true;
+
+/// The owners of what a kernel with parameters @p P reads, its own first; null: none.
+template <class P>
+constexpr std::array<const char *, 2> owners_of()
+{
+  if constexpr (is_both<P>)
+    return {owners_of<decltype(P::own)>()[0], owners_of<decltype(P::other)>()[0]};
+  else if constexpr (std::is_empty_v<P>)
+    return {};
+  else
+    return {P::owner, nullptr};
+}
 
 /// The constants of PetscDS are a directory: [n, (tag, offset) x n, payload]. Each effect finds its own
 /// block by the tag made from its name and needs to know of no other.
@@ -40,7 +64,10 @@ template <class P>
 P get(const PetscScalar c[])
 {
   P p{};
-  if constexpr (!std::is_empty_v<P>) {
+  if constexpr (is_both<P>) {
+    p.own = get<decltype(p.own)>(c);
+    p.other = get<decltype(p.other)>(c);
+  } else if constexpr (!std::is_empty_v<P>) {
     static_assert(std::is_trivially_copyable_v<P> && sizeof(P) % sizeof(PetscScalar) == 0,
                   "parameters reach the kernels as plain scalars");
     constexpr PetscScalar wanted = tag(P::owner);
@@ -191,7 +218,7 @@ Point make_point(PointState &storage, PetscInt Nf, PetscInt NfAux, const PetscIn
   if (!made) make_point_state(u_x + uOff_x[displacement], NfAux > 0 ? a_x + aOff_x[displacement] : nullptr, storage);
   Memory memory;
   if constexpr (!std::is_empty_v<P>)
-    if (made && a_t) memory = constants::memory(*reinterpret_cast<const Memory *>(a_t), P::owner, c);
+    if (made && a_t) memory = constants::memory(*reinterpret_cast<const Memory *>(a_t), owners_of<P>()[0], c);
   return {made ? *reinterpret_cast<const PointState *>(a) : storage,
           u + uOff[displacement],
           gas ? u[uOff[pressure]] : 0,
@@ -247,31 +274,22 @@ void surface_jacobian(PULMO_POINT_ARGUMENTS, PetscReal shift, const PetscReal x[
 
 #undef PULMO_POINT_ARGUMENTS
 
-/// A callback and the owner of the parameters that it reads (null: it reads none).
+/// A callback and the owners of the parameters that it reads (null: none).
 template <class F>
 struct Callback {
   F function = nullptr;
-  const char *owner = nullptr;
+  std::array<const char *, 2> owners{};
 };
-
-template <class P>
-constexpr const char *owner_of()
-{
-  if constexpr (std::is_empty_v<P>)
-    return nullptr;
-  else
-    return P::owner;
-}
 
 // The callback of a kernel: residual terms (f0, f1) and Jacobian terms (g0 ... g3) of the volume and of surfaces.
 template <class P, Kernel<P> K>
-constexpr Callback<PetscPointFunc> volume_residual{detail::volume_residual<P, K>, owner_of<P>()};
+constexpr Callback<PetscPointFunc> volume_residual{detail::volume_residual<P, K>, owners_of<P>()};
 template <class P, Kernel<P> K>
-constexpr Callback<PetscPointJac> volume_jacobian{detail::volume_jacobian<P, K>, owner_of<P>()};
+constexpr Callback<PetscPointJac> volume_jacobian{detail::volume_jacobian<P, K>, owners_of<P>()};
 template <class P, Kernel<P> K>
-constexpr Callback<PetscBdPointFunc> surface_residual{detail::surface_residual<P, K>, owner_of<P>()};
+constexpr Callback<PetscBdPointFunc> surface_residual{detail::surface_residual<P, K>, owners_of<P>()};
 template <class P, Kernel<P> K>
-constexpr Callback<PetscBdPointJac> surface_jacobian{detail::surface_jacobian<P, K>, owner_of<P>()};
+constexpr Callback<PetscBdPointJac> surface_jacobian{detail::surface_jacobian<P, K>, owners_of<P>()};
 
 /// A share of the energy balance of a step, from the state at its end and the one at its start: kPa per reference
 /// volume, kPa mm per reference area. Rates are those of @p now.
@@ -293,7 +311,7 @@ template <class P>
 Point own_memory(Point point, const PetscScalar c[])
 {
   if constexpr (!std::is_empty_v<P>)
-    if (point.memory.last) point.memory = constants::memory(point.memory, P::owner, c);
+    if (point.memory.last) point.memory = constants::memory(point.memory, owners_of<P>()[0], c);
   point.constants = c;
   return point;
 }
@@ -314,10 +332,10 @@ void remembered(const Point &now, const PetscScalar c[], PetscScalar value[])
 
 /// Callback of an energy kernel.
 template <class P, EnergyKernel<P> K>
-constexpr Callback<EnergyDensity> energy_density{detail::energy_density<P, K>, owner_of<P>()};
+constexpr Callback<EnergyDensity> energy_density{detail::energy_density<P, K>, owners_of<P>()};
 
 /// Callback of a memory kernel.
 template <class P, MemoryKernel<P> K>
-constexpr Callback<MemoryFunction> remembered{detail::remembered<P, K>, owner_of<P>()};
+constexpr Callback<MemoryFunction> remembered{detail::remembered<P, K>, owners_of<P>()};
 
 } // namespace pulmo

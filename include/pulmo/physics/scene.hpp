@@ -31,8 +31,6 @@ public:
   const std::optional<Openings> &openings() const { return openings_; }
   const Tissue &tissue() const { return *tissue_; }
   const Airflow &airflow() const { return *airflow_; }
-  /// Gas volume at rest Phi0 V0, ml; empty without airflow, where no porosity is given.
-  std::optional<double> functional_residual_capacity() const;
   /// Active effects in order of registration.
   std::vector<const Effect *> active() const;
 

@@ -126,7 +126,6 @@ public:
   bool active() const override { return on_; }
   /// Open to the ventilator; without airflow the surfaces that would be.
   const std::vector<std::string> &surfaces() const { return surfaces_; }
-  PetscReal porosity() const { return porosity_; }
   /// Permeability over viscosity of the tissue at rest, mm^2/(kPa s).
   PetscReal permeability_at_rest() const { return laws_[chosen_]->at_rest(); }
   /// Heat of the flow in a step, by point: quadratic in Grad p, kPa.
@@ -142,7 +141,6 @@ public:
     options.group(name(), about());
     PetscCall(options.flag("", "air flows through the tissue; off: one uniform gas pressure", on_));
     options.group(name(), about(), on_, "-airflow");
-    PetscCall(options.real("porosity", "-", {0, 1, true}, "reference porosity Phi0", porosity_));
     PetscCall(options.names("surfaces", "surfaces that are open to the ventilator", surfaces_));
     for (const auto &law : laws_) names.emplace_back(law->name());
     PetscCall(options.choice("permeability_law", names, "how permeability follows deformation", wanted));
@@ -159,6 +157,7 @@ public:
   PetscErrorCode announce(SceneFacts &facts) override
   {
     facts.airflow = true;
+    facts.porosity = true; // for the numbers: gas at rest, porosity of the fields
     return PETSC_SUCCESS;
   }
 
@@ -210,7 +209,6 @@ private:
   std::vector<std::unique_ptr<PermeabilityLaw>> laws_;
   std::size_t chosen_ = 0;
   bool on_ = false;
-  PetscReal porosity_ = 0.99; // Phi0; enters the output, not the balance laws
   std::vector<std::string> surfaces_{"airway"};
 };
 

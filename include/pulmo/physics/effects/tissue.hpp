@@ -1,8 +1,10 @@
 /// @file
-/// Effect `tissue`: momentum balance of the alveolar tissue, int P' : Grad eta, P' = dW/dF. Always on.
+/// Effect `tissue`: momentum balance of the alveolar tissue, int P' : Grad eta, P' = dW/dF. Always on. Its porosity is
+/// a parameter for others.
 #pragma once
 
 #include "pulmo/physics/effect.hpp"
+#include "pulmo/physics/porosity.hpp"
 
 #include <algorithm>
 #include <cctype>
@@ -18,6 +20,10 @@ public:
   const char *about() const override { return "hyperelastic alveolar tissue (momentum balance)"; }
   bool active() const override { return true; }
   const TissueLaw &law() const { return *laws_[chosen_]; }
+  /// What is not named by a region of its own has.
+  const Porosity &porosity() const { return porosity_; }
+  /// Whether parts of the lung have porosities of their own.
+  bool porosity_varies() const { return porosity_varies_; }
 
   PetscErrorCode declare(Options &options) override
   {
@@ -33,6 +39,12 @@ public:
     PetscCall(options.choice("", names, "tissue law", wanted));
     const auto found = std::find(names.begin(), names.end(), wanted);
     chosen_ = static_cast<std::size_t>(found - names.begin()) / 2;
+    PetscCall(options.real("porosity", "-", {0, 1, true},
+                           "reference porosity Phi0: share of the volume at rest that is air (by region: "
+                           "0.99,right=0.7)",
+                           porosity_.reference));
+    options.only_volumes(porosity_.reference);
+    porosity_varies_ = options.varies(porosity_.reference);
     for (std::size_t i = 0; i < laws_.size(); ++i) {
       const std::string law = laws_[i]->name();
       options.group(name(), "law " + law + " (" + laws_[i]->source() + ")", i == chosen_, "-tissue " + law);
@@ -49,13 +61,15 @@ public:
 
   void fields(Composition &c) const override { c.field("displacement", 3, c.elements().displacement, "mm"); }
 
-  PetscErrorCode terms(Composition &c, const SceneFacts &) const override
+  PetscErrorCode terms(Composition &c, const SceneFacts &facts) const override
   {
     PetscInt count;
     const PetscScalar *parameters = law().parameters(&count);
 
     PetscFunctionBeginUser;
     c.parameters(name(), parameters, count);
+    // the weak form of tissue and gas does without it: J and Phi0 + J - 1 have one rate
+    if (facts.porosity || porosity_varies_) c.parameters(porosity_);
     c.residual("P' : Grad eta", displacement, f1(law().stress_callback()));
     c.jacobian("dP'/dF", displacement, displacement, g3(law().tangent_callback()));
     c.energy(Energy::stored, "elastic_tissue", "", law().stored_callback());
@@ -66,6 +80,8 @@ public:
 private:
   std::vector<std::unique_ptr<TissueLaw>> laws_;
   std::size_t chosen_ = 0;
+  Porosity porosity_;
+  bool porosity_varies_ = false;
 };
 
 } // namespace pulmo

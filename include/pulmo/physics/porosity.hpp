@@ -1,0 +1,18 @@
+/// @file
+/// Reference porosity Phi0: a property of the tissue (`-tissue_porosity`), read by kernels and observers.
+#pragma once
+
+#include <petscsys.h>
+
+namespace pulmo {
+
+/// Handed over where SceneFacts::porosity says that something reads it; may differ by region.
+struct Porosity {
+  static constexpr const char *owner = "porosity";
+  PetscScalar reference = 0.99; ///< Phi0: share of the lung's volume at rest that is air
+
+  /// Eulerian porosity where the volume has changed by J.
+  PetscScalar at(PetscScalar J) const { return 1 - (1 - reference) / J; }
+};
+
+} // namespace pulmo
