@@ -81,6 +81,21 @@ Json regions_json(const RegionAudit &audit, const BreathRows &breath, bool gas)
   return json;
 }
 
+/// Along gravity: at the start of the breath and at the end of its inspiration.
+Json gravity_json(const GravityAudit &audit, const BreathRows &breath)
+{
+  Json json = {{"lung_weight_g", audit.weight()},
+               {"jacobian_gradient_at_start_per_cm", audit.gradient(breath.first)},
+               {"jacobian_gradient_per_cm", audit.gradient(breath.fullest)}};
+  for (int t = 0; t < n_thirds; ++t)
+    json[gravity_thirds[t]] = {{"reference_volume_ml", audit.volume(t)},
+                               {"jacobian_mean_at_start", audit.mean_J(breath.first, t)},
+                               {"jacobian_mean", audit.mean_J(breath.fullest, t)},
+                               {"ventilation_ml", audit.ventilation(breath, t)},
+                               {"ventilation_share", optional_json(audit.ventilation_share(breath, t))}};
+  return json;
+}
+
 /// Where and why a run could not go on.
 Json diagnosis_json(const Diagnosis &d)
 {
@@ -195,6 +210,7 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
     if (audits.energy) json["energy_j"] = energy_json(*audits.energy, audits.energy->rows().back());
     const bool gas = scene.facts().airflow || scene.facts().ventilator;
     json["regions"] = regions_json(audits.regions, last_breath(rows), gas);
+    if (audits.gravity) json["gravity"] = gravity_json(*audits.gravity, last_breath(rows));
     json["functional_residual_capacity_ml"] = optional_json(frc);
     json["reference_volume_ml"] = scene.mesh().volume() / units::mm3_per_ml;
     PetscReal total = 0;

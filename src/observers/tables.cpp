@@ -48,6 +48,20 @@ PetscErrorCode print_regions(MPI_Comm comm, const RegionAudit &audit, const Brea
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode print_gravity(MPI_Comm comm, const GravityAudit &audit, const BreathRows &breath)
+{
+  PetscFunctionBeginUser;
+  PetscCall(PetscPrintf(comm, "\n%-18s %10s %14s %7s %10s %8s\n", "Along gravity", "rest ml", "ventilation ml", "share",
+                        "J at start", "J"));
+  for (int t = 0; t < n_thirds; ++t)
+    PetscCall(PetscPrintf(comm, "  %-16s %10.4g %14.4g %6.1f%% %10.4f %8.4f\n", gravity_thirds[t], audit.volume(t),
+                          audit.ventilation(breath, t), 100 * audit.ventilation_share(breath, t).value_or(0),
+                          audit.mean_J(breath.first, t), audit.mean_J(breath.fullest, t)));
+  PetscCall(PetscPrintf(comm, "  the lung weighs %.4g g; J grows upwards by %.3g per cm at the start, %.3g full\n",
+                        audit.weight(), audit.gradient(breath.first), audit.gradient(breath.fullest)));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 /// What numbers the last complete breath does not define, or defines badly.
 PetscErrorCode print_notes_of_breath(MPI_Comm comm, const std::vector<SignalRow> &rows)
 {
@@ -137,6 +151,7 @@ PetscErrorCode print_numbers(MPI_Comm comm, const Output &output, const Scene &s
   if (scene.facts().ventilator) PetscCall(print_notes(comm, scene, rows));
   if (audits.energy) PetscCall(print_energy(comm, *audits.energy, breath, breathes ? "breath" : "run"));
   if (audits.regions.regions().size() > 1) PetscCall(print_regions(comm, audits.regions, breath));
+  if (audits.gravity) PetscCall(print_gravity(comm, *audits.gravity, breath));
   PetscCall(PetscPrintf(comm, "\nSmallest J %.4f", (double)simulation.min_J()));
   if (scene.facts().airflow)
     PetscCall(PetscPrintf(comm, "; air lost by the numbers: %.2g ml",

@@ -2,6 +2,7 @@
 
 #include "pulmo/physics/effects/airflow.hpp"
 #include "pulmo/physics/effects/chest_wall.hpp"
+#include "pulmo/physics/effects/gravity.hpp"
 #include "pulmo/physics/effects/lumen_pressure.hpp"
 #include "pulmo/physics/effects/pressure_damping.hpp"
 #include "pulmo/physics/effects/support.hpp"
@@ -29,6 +30,7 @@ Registry Registry::standard()
   r.permeability_law<ConstantPermeability>();
   // effects beside tissue, airflow and ventilator
   r.effect<ChestWall>();
+  r.effect<Gravity>();
   r.effect<LumenPressure>();
   r.effect<PressureDamping>();
   r.effect<Support>();

@@ -134,6 +134,23 @@ PetscErrorCode warn_of_size(MPI_Comm comm, const Scene &scene)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+/// A lung at rest has 0.2 to 0.3 g/ml, where the default porosity (the paper's, for which weight is nothing) gives
+/// 0.012.
+PetscErrorCode note_weightless(MPI_Comm comm, const Scene &scene, const GravityAudit &gravity)
+{
+  constexpr double light = 0.1, real = 0.26, tissue = 1.05; // g/ml
+  const double volume = scene.mesh().volume() / units::mm3_per_ml;
+
+  PetscFunctionBeginUser;
+  if (gravity.weight() < light * volume)
+    PetscCall(PetscPrintf(comm,
+                          "pulmo: note: with -tissue_porosity %g a lung of %.4g ml weighs %.3g g, so that gravity does "
+                          "almost nothing; a real one of that size weighs about %.3g g: give -tissue_porosity %.2f\n",
+                          (double)scene.tissue().porosity().reference, volume, gravity.weight(), real * volume,
+                          1 - real / tissue));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 /// Elements of equal order are not stable where the tissue is undrained: in steps @p dt (s) in which pressure spreads
 /// by less than half a cell, k M dt < (h/2)^2. Says so, once.
 PetscErrorCode warn_of_equal_order(MPI_Comm comm, const Scene &scene, const Model &model, PetscReal dt, bool &warned)
@@ -464,13 +481,20 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
                    "-energy_audit: the balance is that of backward Euler; leave the option out with -ts_type bdf");
     audit_energy = false;
   }
-  Audits audits{regions, audit_energy ? &energy : nullptr};
+  GravityAudit gravity(scene, run.model(), sampling);
+  const bool heavy = scene.facts().gravity.has_value();
+  Audits audits{regions, audit_energy ? &energy : nullptr, heavy ? &gravity : nullptr};
   PetscCall(sampling.setup(run.model()));
   PetscCall(regions.setup());
   simulation.add(regions);
   if (audit_energy) {
     PetscCall(energy.setup());
     simulation.add(energy);
+  }
+  if (heavy) {
+    PetscCall(gravity.setup());
+    PetscCall(note_weightless(comm, scene, gravity));
+    simulation.add(gravity);
   }
   UnusedOptions unused(options, scene);
   simulation.add(unused);

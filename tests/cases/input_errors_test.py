@@ -356,6 +356,8 @@ def table(m):
         "out of range": (good + ["-airflow_permeability", "-3"], ["-airflow_permeability", "-3", "out of range", "> 0"]),
         "porosity by its old name": (good + ["-airflow_porosity", "0.8"],
                                      ["-airflow_porosity", "is called -tissue_porosity now", "give -tissue_porosity 0.8"]),
+        "a direction that is none": (good + ["-gravity", "-gravity_direction", "0,0,0"],
+                                     ["-gravity_direction", "points nowhere", "0,-1,0"]),
         "porosity above one": (good + ["-tissue_porosity", "1.5"], ["-tissue_porosity", "1.5", "0 < value < 1"]),
         "scale of nothing": (good + ["-mesh_scale", "0"], ["-mesh_scale", "out of range", "1e-09 <="]),
         "scale beyond measure": (good + ["-mesh_scale", "1e300"], ["-mesh_scale", "1e300", "out of range"]),

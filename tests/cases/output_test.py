@@ -519,7 +519,9 @@ class Help(unittest.TestCase):
         "-ventilator_breaths": "-", "-lumen_pressure": "on/off", "-lumen_pressure_surfaces": None, "-support": "on/off",
         "-support_rigid": "on/off", "-support_surfaces": None, "-traction": "on/off", "-traction_surfaces": None,
         "-traction_value": "kPa", "-quadrature_degree": "-", "-output_dir": "text", "-output_overwrite": "on/off",
-        "-output_fields_every": "s", "-output_fields_error_indicator": "on/off", "-progress": "on/off", "-effects_view": "on/off", "-energy_audit": "on/off"}
+        "-output_fields_every": "s", "-output_fields_error_indicator": "on/off", "-progress": "on/off", "-effects_view": "on/off", "-energy_audit": "on/off",
+        "-gravity": "on/off", "-gravity_direction": "-", "-gravity_acceleration": "m/s^2", "-gravity_tissue_density": "kg/m^3",
+        "-gravity_air_density": "kg/m^3"}
 
     def test_every_option_with_its_unit(self):
         case = pulmo.finished(["-help"])

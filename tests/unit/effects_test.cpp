@@ -3,6 +3,7 @@
 
 #include "pulmo/physics/effects/airflow.hpp"
 #include "pulmo/physics/effects/chest_wall.hpp"
+#include "pulmo/physics/effects/gravity.hpp"
 #include "pulmo/physics/effects/lumen_pressure.hpp"
 #include "pulmo/physics/effects/traction.hpp"
 #include "pulmo/physics/effects/ventilator.hpp"
@@ -278,6 +279,56 @@ TEST(ChestWall, SpringsResistTheVectorOrItsNormalPart)
   });
 }
 
+TEST(Airflow, AForceOnTheGasDrivesItLikeAGradient)
+{
+  using Law = PowerPermeability;
+  using K = DarcyKernels<Law>;
+  using P = Both<Law::Parameters, GasForce>;
+  const P k{{}, {{0.4, -0.7, 0.25}}};
+  at_points([&](Data d) {
+    d.step.load = 0.75;
+    // Q = k J F^-1 F^-T (F^T f - Grad p): f alone is a gradient of the opposite sign
+    const Tensor inverse_F = inverse(d.F()), inverse_C = inverse_F * transposed(inverse_F);
+    const double J = det(d.F()), kJ = Law::permeability(J, k.own).k * J;
+    double w[3], Q[3] = {0, 0, 0}, still[3] = {0, 0, 0}, work = 0, heat = 0;
+    for (int I = 0; I < 3; ++I) {
+      w[I] = 0;
+      for (int i = 0; i < 3; ++i) w[I] += 0.75 * d.F()[3 * i + I] * k.other.value[i];
+    }
+    for (int I = 0; I < 3; ++I)
+      for (int L = 0; L < 3; ++L) {
+        Q[I] += kJ * inverse_C[3 * I + L] * (w[L] - d.grad_p[L]);
+        still[I] += kJ * inverse_C[3 * I + L] * -d.grad_p[L];
+      }
+    const auto added = d.call<P>(K::force_flux, k, 3);
+    for (int I = 0; I < 3; ++I) EXPECT_NEAR(added[I], still[I] - Q[I], 1e-12 * (1 + std::abs(Q[I])));
+    expect_derivative<P>(d, K::force_flux, K::force_flux_by_displacement, k, 3, 9, move_H, scalar_by_vector);
+    // energy: what the force gives, and heat Q . K^-1 Q less that without it
+    PointState s;
+    make_point_state(d.H.data(), d.rate.data(), s);
+    const Point point{s, d.u, d.p, d.grad_p, 0.2, 0, d.x, d.normal, d.step};
+    for (int I = 0; I < 3; ++I) {
+      work += d.step.dt * Q[I] * w[I];
+      heat += d.step.dt * (Q[I] * (w[I] - d.grad_p[I]) - still[I] * -d.grad_p[I]);
+    }
+    EXPECT_NEAR(K::force_work(point, point, k), work, 1e-12 * (1 + std::abs(work)));
+    EXPECT_NEAR(K::force_heat(point, point, k), heat, 1e-12 * (1 + std::abs(heat)));
+  });
+}
+
+TEST(Gravity, WeightOfTissueAndOfTheAirThatIsThere)
+{
+  using K = GravityKernels;
+  const K::Parameters k{{900, 40, {0.3e-3, -0.8e-3, 0.1e-3}}, {0.7}};
+  at_points([&](Data d) {
+    d.step.load = 0.6;
+    const double R = 0.3 * 900 + (det(d.F()) - 0.3) * 40;
+    const auto f0 = d.call<K::Parameters>(K::weight, k, 3);
+    for (int i = 0; i < 3; ++i) EXPECT_NEAR(f0[i], -0.6 * R * k.own.force[i], 1e-13);
+    expect_derivative<K::Parameters>(d, K::weight, K::weight_by_displacement, k, 3, 9, move_H, nine);
+  });
+}
+
 TEST(Traction, IsADeadLoadPerReferenceArea)
 {
   using K = TractionKernels;
@@ -319,8 +370,8 @@ TEST(Constants, EveryOwnerFindsItsOwnBlock)
   EXPECT_EQ(both.own.three, 3);
   EXPECT_EQ(both.other.two, 2);
   // the names in use have tags of their own, exact in a double
-  const char *owners[] = {"step",     "tissue",     "permeability", "chest_wall",
-                          "traction", "ventilator", "airflow",      "support"};
+  const char *owners[] = {"step",    "tissue",  "permeability", "chest_wall", "traction", "ventilator",
+                          "airflow", "support", "porosity",     "gravity",    "gas_force"};
   for (const char *a : owners)
     for (const char *b : owners) EXPECT_EQ(constants::tag(a) == constants::tag(b), std::string(a) == b);
 }

@@ -5,6 +5,7 @@
 #include "pulmo/base/run_lock.hpp"
 #include "pulmo/observers/energy.hpp"
 #include "pulmo/observers/error_bars.hpp"
+#include "pulmo/observers/gravity_audit.hpp"
 #include "pulmo/observers/regions.hpp"
 #include "pulmo/time/simulation.hpp"
 
@@ -142,8 +143,9 @@ private:
 /// What a run was watched by, and what is known of its errors.
 struct Audits {
   const RegionAudit &regions;
-  const EnergyAudit *energy;           ///< null with -energy_audit off
-  const ErrorReport *errors = nullptr; ///< null before the estimate, or without -error_estimate
+  const EnergyAudit *energy;             ///< null with -energy_audit off
+  const GravityAudit *gravity = nullptr; ///< null without gravity
+  const ErrorReport *errors = nullptr;   ///< null before the estimate, or without -error_estimate
 };
 
 /// Why a run with a ventilator has no clinical numbers, if it has none.

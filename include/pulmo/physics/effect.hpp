@@ -363,12 +363,20 @@ struct Settling {
   bool pressure = false;                      ///< so is the pressure that the airway begins with
 };
 
+/// Gravity, as others may know it.
+struct GravityFacts {
+  std::array<PetscReal, 3> down{}; ///< unit vector along it
+  Callback<EnergyDensity> mass;    ///< of tissue and air at a point, kg per m^3 of reference volume (1e-3 g/ml)
+};
+
 /// What one effect may know of the scene beside itself.
 struct SceneFacts {
   Elements elements;
-  const TissueLaw *law = nullptr;              ///< of the tissue
-  bool airflow = false;                        ///< the pressure field exists
-  bool porosity = false;                       ///< a kernel or an observer reads the tissue's porosity (Porosity)
+  const TissueLaw *law = nullptr;                ///< of the tissue
+  bool airflow = false;                          ///< the pressure field exists
+  bool porosity = false;                         ///< a kernel or an observer reads the tissue's porosity (Porosity)
+  const PermeabilityLaw *permeability = nullptr; ///< that the gas flows by; null without airflow
+  std::optional<GravityFacts> gravity;
   std::vector<std::string> airway_surfaces;    ///< open to the ventilator; without airflow those that would be
   std::shared_ptr<const Programme> ventilator; ///< null without a ventilator
   Settling settling;

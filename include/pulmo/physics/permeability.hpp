@@ -35,6 +35,21 @@ struct ConstantPermeability {
   static PermeabilityValue permeability(PetscScalar, const Parameters &p) { return {p.k, 0}; }
 };
 
+/// A force on the gas, kPa per mm of the deformed lung, beside -grad p. An effect that brings one adds the terms of
+/// GasForceCallbacks; airflow knows of none.
+struct GasForce {
+  static constexpr const char *owner = "gas_force";
+  PetscScalar value[3] = {0, 0, 0}; ///< a dead load: Step::load counts
+};
+
+/// What a force on the gas adds to the flux of a permeability law.
+struct GasForceCallbacks {
+  Callback<PetscPointFunc> flux;                ///< f1 of the mass row
+  Callback<PetscPointJac> flux_by_displacement; ///< g3 of (mass, displacement)
+  Callback<EnergyDensity> work;                 ///< of the force on the flux, kPa in a step
+  Callback<EnergyDensity> heat;                 ///< by which the heat of the flow differs from that of -grad p alone
+};
+
 /// The flux kernels of airflow with permeability law @p Law; see effects/airflow.hpp.
 template <class Law>
 struct DarcyKernels;
@@ -51,6 +66,7 @@ public:
   virtual Callback<PetscPointJac> flux_by_displacement_callback() const = 0;
   virtual Callback<PetscPointJac> flux_by_pressure_callback() const = 0;
   virtual Callback<EnergyDensity> dissipation_callback() const = 0;
+  virtual GasForceCallbacks gas_force_callbacks() const = 0;
 };
 
 template <class Law>
@@ -79,6 +95,12 @@ public:
   Callback<EnergyDensity> dissipation_callback() const override
   {
     return energy_density<Parameters, Kernels::dissipation>;
+  }
+  GasForceCallbacks gas_force_callbacks() const override
+  {
+    using P = Both<Parameters, GasForce>;
+    return {volume_residual<P, Kernels::force_flux>, volume_jacobian<P, Kernels::force_flux_by_displacement>,
+            energy_density<P, Kernels::force_work>, energy_density<P, Kernels::force_heat>};
   }
 
 private:

@@ -113,6 +113,52 @@ struct DarcyKernels {
           g3[9 * k + 3 * I + L] += (v.k + s.J * v.dk_dJ) * cof[3 * k + L] * a[I] -
                                    v.k * (cof[3 * k + I] * a[L] + s.J * C_inv[3 * I + L] * b[k]);
   }
+
+  // A force f on the gas: Q = k J F^-1 (f - F^-T Grad p), so it adds -k J F^-1 f = -k cof^T f to f1.
+
+  static void force_flux(const Point &point, const Both<Parameters, GasForce> &p, PetscScalar f1[])
+  {
+    const PetscScalar *cof = point.state.cof_F, *f = p.other.value;
+    const PetscScalar k = point.step.load * Law::permeability(point.state.J, p.own).k;
+    for (int I = 0; I < 3; ++I) f1[I] -= k * (cof[I] * f[0] + cof[3 + I] * f[1] + cof[6 + I] * f[2]);
+  }
+  /// -d(k cof_iI f_i) / dF_kL.
+  static void force_flux_by_displacement(const Point &point, const Both<Parameters, GasForce> &p, PetscScalar g3[])
+  {
+    const PetscScalar *cof = point.state.cof_F, *f = p.other.value, load = point.step.load;
+    const PermeabilityValue v = Law::permeability(point.state.J, p.own);
+    PetscScalar cof_by_F[81] = {0}; // [i][k][I][L]
+    add_cofactor_derivative(point.state.F, load * v.k, cof_by_F);
+    for (int k = 0; k < 3; ++k)
+      for (int I = 0; I < 3; ++I)
+        for (int L = 0; L < 3; ++L)
+          for (int i = 0; i < 3; ++i)
+            g3[9 * k + 3 * I + L] -=
+                (load * v.dk_dJ * cof[3 * k + L] * cof[3 * i + I] + cof_by_F[27 * i + 9 * k + 3 * I + L]) * f[i];
+  }
+  /// dt Q . F^T f = dt k (J f - cof Grad p) . f.
+  static PetscScalar force_work(const Point &point, const Point &, const Both<Parameters, GasForce> &p)
+  {
+    return force_power(point, p, 1);
+  }
+  /// Heat of the flow, dt k/J |J f - cof Grad p|^2, less dissipation().
+  static PetscScalar force_heat(const Point &point, const Point &, const Both<Parameters, GasForce> &p)
+  {
+    return force_power(point, p, 2);
+  }
+
+private:
+  /// dt k (J f - @p share cof Grad p) . f.
+  static PetscScalar force_power(const Point &point, const Both<Parameters, GasForce> &p, PetscScalar share)
+  {
+    const PetscScalar *cof = point.state.cof_F, *g = point.grad_p, J = point.state.J;
+    PetscScalar sum = 0;
+    for (int i = 0; i < 3; ++i) {
+      const PetscScalar f = point.step.load * p.other.value[i];
+      sum += f * (J * f - share * (cof[3 * i] * g[0] + cof[3 * i + 1] * g[1] + cof[3 * i + 2] * g[2]));
+    }
+    return point.step.dt * Law::permeability(J, p.own).k * sum;
+  }
 };
 
 /// Alveolar pressure field (kPa), its gas stress, mass balance and Darcy flux. Where the lung is open the
@@ -157,6 +203,7 @@ public:
   PetscErrorCode announce(SceneFacts &facts) override
   {
     facts.airflow = true;
+    facts.permeability = laws_[chosen_].get();
     facts.porosity = true; // for the numbers: gas at rest, porosity of the fields
     return PETSC_SUCCESS;
   }
