@@ -38,18 +38,37 @@ PetscErrorCode handle_signal(int signal, void *)
   return PETSC_ERR_SIG;
 }
 
-/// Tissue stiffness that scales the equations: the largest diagonal entry of dP'/dF at F = I, kPa.
-PetscReal reference_modulus(const TissueLaw &law)
+/// Tissue stiffness that scales the equations: the largest diagonal entry of dP'/dF at F = I, kPa. Where parameters
+/// differ from place to place that of the softest place, or the solver's tolerances would say nothing of it.
+/// Collective.
+PetscErrorCode reference_modulus(const TissueLaw &law, const Composition &composition, PetscReal &modulus)
 {
   const PetscScalar zero[9] = {0};
-  PetscScalar A[81];
+  const DM dm = composition.mesh().dm();
   PointState state;
+  PetscInt begin, end;
+
+  PetscFunctionBeginUser;
   make_point_state(zero, nullptr, state);
-  law.tangent(state, A);
-  PetscReal largest = 0;
-  for (int i = 0; i < 3; ++i)
-    for (int J = 0; J < 3; ++J) largest = std::max(largest, std::abs(A[27 * i + 9 * i + 4 * J]));
-  return largest > 0 ? largest : 1;
+  const auto stiffness = [&](const PetscScalar *constants) {
+    PetscScalar A[81];
+    PetscReal largest = 0;
+    law.tangent(state, constants, A);
+    for (int i = 0; i < 3; ++i)
+      for (int J = 0; J < 3; ++J) largest = std::max(largest, std::abs(A[27 * i + 9 * i + 4 * J]));
+    return largest > 0 ? largest : 1;
+  };
+  modulus = stiffness(nullptr);
+  if (!composition.varying()) PetscFunctionReturn(PETSC_SUCCESS);
+  std::vector<PetscScalar> constants = composition.constants(Step());
+  modulus = PETSC_MAX_REAL;
+  PetscCall(DMPlexGetHeightStratum(dm, 0, &begin, &end));
+  for (PetscInt c = 0; c < end - begin; ++c) {
+    composition.varying()->patch(c, "", constants);
+    modulus = std::min(modulus, stiffness(constants.data()));
+  }
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &modulus, 1, MPIU_REAL, MPI_MIN, PetscObjectComm((PetscObject)dm)));
+  PetscFunctionReturn(PETSC_SUCCESS);
 }
 
 /// Ends a run that a signal asked to stop: a checkpoint, and how to go on.
@@ -353,8 +372,11 @@ PetscErrorCode check_held(MPI_Comm comm, const Scene &scene, const Composition &
   const std::vector<std::string> walls = composition.surfaces_of("lumen_pressure"),
                                  bearing = composition.bearing_surfaces();
 
+  PetscReal modulus;
+
   PetscFunctionBeginUser;
-  PetscCall(check_held(comm, composition, reference_modulus(scene.tissue().law())));
+  PetscCall(reference_modulus(scene.tissue().law(), composition, modulus));
+  PetscCall(check_held(comm, composition, modulus));
   if (!walls.empty() && std::find(bearing.begin(), bearing.end(), "") == bearing.end())
     PetscCall(check_wall_load(scene.mesh(), walls, bearing));
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -393,6 +415,7 @@ PetscErrorCode Run::declare()
 PetscErrorCode Run::setup()
 {
   PetscLogDouble start, end;
+  PetscReal modulus;
 
   PetscFunctionBeginUser;
   PetscCall(PetscTime(&start));
@@ -406,7 +429,8 @@ PetscErrorCode Run::setup()
   if (!fields->empty()) composition.vary(fields);
   PetscCall(check_prescribed_once(composition));
   PetscCall(pin_free_motions(composition));
-  PetscCall(model_.build(std::move(composition), reference_modulus(scene_.tissue().law())));
+  PetscCall(reference_modulus(scene_.tissue().law(), composition, modulus));
+  PetscCall(model_.build(std::move(composition), modulus));
   PetscCall(check_stable_at_rest(options_, scene_, model_)); // before any load is looked at
   PetscCall(settle_under_loads(scene_, model_, settle_note_));
   PetscCall(simulation_.setup());
