@@ -1,11 +1,14 @@
 #include "pulmo/input/options.hpp"
 
+#include "pulmo/input/cell_values.hpp"
+
 #include <algorithm>
 #include <cctype>
 #include <cmath>
 #include <cstdio>
 #include <cstdlib>
 #include <map>
+#include <numeric>
 #include <optional>
 #include <sstream>
 
@@ -154,6 +157,16 @@ bool is_of_blocks(const std::string &option, bool of_one)
          begins_with(option, of_one ? displacement + "ksp_" : displacement);
 }
 
+/// Whether a value is FILE:dataset. Names of the mesh may hold a colon, too, but they follow a number.
+bool names_dataset(const std::string &value)
+{
+  const std::size_t colon = value.rfind(':');
+  if (colon == std::string::npos || colon == 0 || colon + 1 == value.size()) return false;
+  char *end = nullptr;
+  (void)std::strtod(value.c_str(), &end);
+  return end == value.c_str() || (*end != ',' && *end != '\0' && *end != ' ');
+}
+
 /// Options of the levels of a multigrid, which may have a single one.
 bool is_of_levels(const std::string &option)
 {
@@ -261,12 +274,16 @@ PetscErrorCode Options::parse_varying(const std::string &option, const std::stri
   Varying varying;
 
   PetscFunctionBeginUser;
+  if (names_dataset(raw)) {
+    PetscCall(parse_dataset(option, raw, unit, range, value));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
   if (raw.find('=') == std::string::npos) {
     PetscCall(parse_number(option, raw, unit, range, number));
     value = number;
     PetscFunctionReturn(PETSC_SUCCESS);
   }
-  PulmoUserCheck(parts.front().find('=') == std::string::npos, comm_,
+  PulmoUserCheck(!parts.empty() && parts.front().find('=') == std::string::npos, comm_,
                  "option %s begins with the value (%s) of all that is not named, e.g. 1,%s", option.c_str(),
                  unit.c_str(), raw.c_str());
   PetscCall(parse_number(option, parts.front(), unit, range, number));
@@ -290,6 +307,57 @@ PetscErrorCode Options::parse_varying(const std::string &option, const std::stri
   }
   varying_.push_back(varying);
   PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Options::parse_dataset(const std::string &option, const std::string &raw, const std::string &unit,
+                                      const Range &range, PetscReal &value)
+{
+  const std::size_t colon = raw.rfind(':');
+  auto values = std::make_shared<std::vector<double>>();
+  std::string fault;
+  double mean = 0;
+  PetscMPIInt rank;
+  Varying varying;
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Comm_rank(comm_, &rank));
+  if (rank == 0) {
+    fault = read_cell_values(raw.substr(0, colon), raw.substr(colon + 1), *values);
+    const auto bad =
+        std::find_if(values->begin(), values->end(), [&](double v) { return !std::isfinite(v) || !range.holds(v); });
+    if (fault.empty() && bad != values->end())
+      fault = ": value " + std::to_string(bad - values->begin()) + ", counted from 0, is " + number_text(*bad) + " (" +
+              unit + "); each must be a number" + (range.text() == "any" ? "" : " " + range.text());
+    if (fault.empty())
+      mean = std::accumulate(values->begin(), values->end(), 0.0) / static_cast<double>(values->size());
+  }
+  PetscCall(from_root(comm_, fault));
+  PulmoUserCheck(fault.empty(), comm_, "option %s %s%s", option.c_str(), raw.c_str(), fault.c_str());
+  PetscCallMPI(MPI_Bcast(&mean, 1, MPI_DOUBLE, 0, comm_));
+  value = mean;
+  varying.option = option;
+  varying.unit = unit;
+  varying.text = raw;
+  varying.target = &value;
+  varying.everywhere = value;
+  varying.by_cell = true;
+  varying.of_cell = values;
+  varying_.push_back(varying);
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+bool Options::varies_by_cell() const
+{
+  return std::any_of(varying_.begin(), varying_.end(), [](const Varying &v) { return v.by_cell; });
+}
+
+OptionList Options::by_content(OptionList list) const
+{
+  for (auto &[name, value] : list) {
+    const auto content = content_.find(name);
+    if (content != content_.end()) value = content->second;
+  }
+  return list;
 }
 
 bool Options::varies(const PetscReal &value) const
@@ -698,8 +766,12 @@ PetscErrorCode Options::print_help() const
   std::string last;
 
   PetscFunctionBeginUser;
-  PetscCall(
-      PetscPrintf(comm_, "pulmo's own options (beside PETSc's: -dm_plex_filename, -ts_*, -snes_*, -ksp_*, -pc_*):\n"));
+  PetscCall(PetscPrintf(
+      comm_, "pulmo's own options (beside PETSc's: -dm_plex_filename, -ts_*, -snes_*, -ksp_*, -pc_*).\nParameters of "
+             "laws and effects may differ from place to place: -tissue_c 0.36,right_lung=0.7 gives "
+             "a value\nto a volume of the mesh (or to a surface, where the effect acts on surfaces) and another to "
+             "the rest,\n-tissue_c FILE.h5:dataset one to each tetrahedron in the order of the mesh file "
+             "(docs/running.md).\n"));
   for (const Declared &d : declared_) {
     const std::string &about = groups_[d.group].about;
     if (about != last) PetscCall(PetscPrintf(comm_, "\n%s\n", about.c_str()));

@@ -6,6 +6,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstdint>
 #include <iterator>
 
 namespace pulmo {
@@ -38,6 +39,14 @@ constexpr Refused refused[] = {
     {"-dm_refine_volume_limit_pre", "pulmo refines every cell alike: give -dm_refine"},
     {"-dm_distribute_overlap", "pulmo works without overlap; leave the option out"},
 };
+
+/// The number of a cell in the file is carried by a label for each digit to this base.
+constexpr PetscInt place_base = 64;
+
+std::string place_label(PetscInt digit)
+{
+  return "pulmo place " + std::to_string(digit);
+}
 
 PetscErrorCode refuse_options(MPI_Comm comm)
 {
@@ -164,12 +173,17 @@ PetscErrorCode Mesh::read(const Options &options, bool ventilated)
   double whole[2] = {static_cast<double>(file.cells.size()), file.volume * scale_ * scale_ * scale_};
   PetscCallMPI(MPI_Bcast(whole, 2, MPI_DOUBLE, 0, comm));
   PetscCall(build(comm, file));
+  tetrahedra_ = file.tetrahedra;
+  PetscCallMPI(MPI_Bcast(&tetrahedra_, 1, MPIU_INT, 0, comm));
+  places_.clear();
+  if (options.varies_by_cell()) PetscCall(label_places(file));
 
   // cells that are neighbours in space become neighbours in memory: mesh generators number them at random, and then
   // assembly, products and smoothers mostly wait for memory
   PetscCall(PetscOptionsHasName(nullptr, nullptr, "-dm_plex_reorder", &given));
   if (!given) PetscCall(PetscOptionsSetValue(nullptr, "-dm_plex_reorder", MATORDERINGRCM));
   PetscCall(DMSetFromOptions(dm_)); // reorders, distributes, refines
+  if (options.varies_by_cell()) PetscCall(read_places());
   PetscCall(DMViewFromOptions(dm_, nullptr, "-dm_view"));
   for (Part &part : parts_) PetscCall(DMGetLabel(dm_, part.name.c_str(), &part.label));
   PetscCall(DMGetCoordinatesLocal(dm_, &local));
@@ -223,6 +237,57 @@ PetscErrorCode Mesh::build(MPI_Comm comm, const NamedMesh &file)
       }
       PetscCall(DMLabelSetValue(parts_[i].label, point, parts_[i].dimension));
     }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// A label for each digit of the number: labels with a value for each cell take PETSc a kilobyte a cell.
+PetscErrorCode Mesh::label_places(const NamedMesh &file)
+{
+  PetscInt digit = 0;
+
+  PetscFunctionBeginUser;
+  for (std::int64_t unit = 1; unit < tetrahedra_; ++digit, unit *= place_base) {
+    DMLabel label;
+    PetscCall(DMCreateLabel(dm_, place_label(digit).c_str()));
+    PetscCall(DMGetLabel(dm_, place_label(digit).c_str(), &label));
+    for (std::size_t c = 0; c < file.place.size(); ++c)
+      PetscCall(
+          DMLabelSetValue(label, static_cast<PetscInt>(c), static_cast<PetscInt>(file.place[c] / unit % place_base)));
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Mesh::read_places()
+{
+  PetscInt begin, end;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMPlexGetHeightStratum(dm_, 0, &begin, &end));
+  places_.assign(static_cast<std::size_t>(end - begin), 0);
+  PetscInt digits = 0, found = 0;
+  for (std::int64_t unit = 1; unit < tetrahedra_; ++digits, unit *= place_base) {
+    DMLabel label;
+    PetscCall(DMGetLabel(dm_, place_label(digits).c_str(), &label));
+    PetscCheck(label, PETSC_COMM_SELF, PETSC_ERR_PLIB, "a label is lost");
+    for (PetscInt value = 0; value < place_base; ++value) {
+      ISHandle points;
+      const PetscInt *point;
+      PetscInt n;
+      PetscCall(DMLabelGetStratumIS(label, value, points.out()));
+      if (!points) continue;
+      PetscCall(ISGetLocalSize(points, &n));
+      PetscCall(ISGetIndices(points, &point));
+      for (PetscInt i = 0; i < n; ++i) {
+        if (point[i] < begin || point[i] >= end) continue; // refinement marks the faces within a cell, too
+        places_[static_cast<std::size_t>(point[i] - begin)] += static_cast<PetscInt>(value * unit);
+        ++found;
+      }
+      PetscCall(ISRestoreIndices(points, &point));
+    }
+    PetscCall(DMRemoveLabel(dm_, place_label(digits).c_str(), nullptr));
+  }
+  PetscCheck(found == digits * (end - begin), PETSC_COMM_SELF, PETSC_ERR_PLIB, "%d digits of numbers of %d cells",
+             static_cast<int>(found), static_cast<int>(end - begin));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -94,6 +94,7 @@ private:
   struct Named {
     std::array<int, N> nodes;
     long id;
+    int place;              ///< among the elements of the file
     std::vector<int> names; ///< indices into names_, ascending
   };
   struct Name {
@@ -203,8 +204,12 @@ private:
   std::vector<Named<N>> merged(const std::vector<MeshFile::Element<N>> &elements, bool once)
   {
     std::vector<Named<N>> all;
+    int place = -1;
+    long last = 0;
     for (const auto &element : elements) {
-      Named<N> one{sorted(numbered<N>(element)), element.id, {}};
+      if (place < 0 || element.id != last) ++place; // one of several groups is there once for each
+      last = element.id;
+      Named<N> one{sorted(numbered<N>(element)), element.id, place, {}};
       if (element.group >= 0) one.names.push_back(name_of_group_[element.group]);
       all.push_back(one);
     }
@@ -217,6 +222,7 @@ private:
         result.push_back(one);
         continue;
       }
+      result.back().place = std::min(result.back().place, one.place);
       std::vector<int> &names = result.back().names;
       const bool further = !names.empty() && !one.names.empty() && names.back() != one.names.back();
       if (once && !further)
@@ -250,8 +256,11 @@ private:
       if (!(share > degenerate_share)) ++bad;
       if (!(share >= worst.share)) worst = {share, cell};
       mesh_.cells.push_back(cell);
+      mesh_.place.push_back(named.place);
       mesh_.volume += volume;
     }
+    for (std::size_t i = 0; i < file_.cells.size(); ++i)
+      mesh_.tetrahedra += i == 0 || file_.cells[i].id != file_.cells[i - 1].id;
     if (bad > 0)
       throw Fault{
           "holds " + counted(bad, "degenerate cell") + ", the worst at " + at(worst.cell) +

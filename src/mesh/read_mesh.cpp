@@ -3,6 +3,7 @@
 #include "pulmo/mesh/elements.hpp"
 #include "pulmo/mesh/msh.hpp"
 
+#include <algorithm>
 #include <filesystem>
 #include <fstream>
 #include <sstream>
@@ -102,6 +103,7 @@ PetscErrorCode read_labels(DM dm, MeshFile &mesh)
     mesh.cells.push_back({static_cast<long>(c), -1, {}});
     PetscCall(vertices(c, mesh.cells.back().nodes.data()));
   }
+  std::stable_sort(mesh.cells.begin(), mesh.cells.end(), [](const auto &a, const auto &b) { return a.id < b.id; });
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

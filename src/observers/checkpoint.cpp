@@ -211,7 +211,7 @@ PetscErrorCode Checkpoint::persist_scene(Archive &archive)
                  "-dm_plex_filename and -mesh_scale",
                  restart_.c_str(), mesh.c_str(), order_.identity().c_str());
   PetscCall(persist_names(archive));
-  OptionList own = options_.own_used();
+  OptionList own = options_.by_content(options_.own_used());
   own.erase(std::remove_if(own.begin(), own.end(), [](const auto &o) { return is_free(o.first); }), own.end());
   options = text_of(own);
   PetscCall(archive.text("options", options));
@@ -239,7 +239,7 @@ PetscErrorCode Checkpoint::persist_names(Archive &archive)
 
 PetscErrorCode Checkpoint::compare_options(const std::string &stored) const
 {
-  const OptionList then = named_values(stored), now = options_.own_used();
+  const OptionList then = named_values(stored), now = options_.by_content(options_.own_used());
 
   PetscFunctionBeginUser;
   const auto refuse = [&](const std::string &name) -> PetscErrorCode {
@@ -266,6 +266,7 @@ PetscErrorCode Checkpoint::persist_numerics(Archive &archive)
 
   PetscFunctionBeginUser;
   PetscCall(options_.all_used(now));
+  now = options_.by_content(now);
   now.erase(std::remove_if(now.begin(), now.end(),
                            [](const auto &o) { return begins_with_one_of(aside, o.first) || prints(o.first); }),
             now.end());

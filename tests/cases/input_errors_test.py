@@ -10,6 +10,7 @@ import subprocess
 import unittest
 from concurrent.futures import ThreadPoolExecutor
 
+import h5py
 import meshio
 import numpy as np
 
@@ -202,6 +203,13 @@ def meshes():
     cube.tags["triangle"] = np.append(cube.tags["triangle"], [pleura] * len(part))
     made["whole_boundary"] = cube.write("whole_boundary")
 
+    cube = Cube()  # half of the lung is in a group of its own, too
+    half = cube.cells["tetra"][:50]
+    cube.names.append((3, 99, "half"))
+    cube.cells["tetra"] = np.concatenate([cube.cells["tetra"], half])
+    cube.tags["tetra"] = np.append(cube.tags["tetra"], [99] * len(half))
+    made["overlapping_parts"] = cube.write("overlapping_parts")
+
     def edited(name, *changes, of="good"):
         with open(made.get(of, of), "rb") as f:
             text = f.read()
@@ -248,6 +256,14 @@ def table(m):
     def options_of(name, text):
         return good + ["-options_file", text_file(name, text)]
 
+    def values(name, data, option="-tissue_c"):
+        path = pulmo.scratch(name + ".h5")
+        with h5py.File(path, "w") as f:
+            f[name] = data
+        return [option, f"{path}:{name}"]
+
+    some = np.full(100, 0.5)
+    listed = values("some", some)[1]
     itself = ["-options_file", pulmo.scratch("itself.opts")]
     with open(itself[1], "w") as f:
         f.write(f"-airflow\n-options_file {itself[1]}\n")
@@ -319,6 +335,42 @@ def table(m):
                                               [m["other_number"], "group 77", "the number of another one ('airway')"]),
         "a body without an airway": (with_mesh(m["shut_body"]) + ["-mesh_scale", "1"],
                                      [m["shut_body"], "the body around (2", "-airflow_surfaces", "name its opening"]),
+        # parameters that differ from place to place
+        "a value of no part of the mesh": (good + ["-tissue_c", "0.36,lobe=0.7"],
+                                           ["-tissue_c", "no volume and no surface 'lobe'", "it has: lung, airway, pleura"]),
+        "a part before the value of the rest": (good + ["-tissue_c", "lung=0.7"],
+                                                ["-tissue_c begins with the value (kPa)", "1,lung=0.7"]),
+        "a value of no name": (good + ["-tissue_c", "0.36,=0.7"], ["-tissue_c", "'=0.7' is no name=value", "right=2"]),
+        "a part without its value": (good + ["-tissue_c", "0.36,lung=0.7,pleura"], ["'pleura' is no name=value"]),
+        "an empty value of a part": (good + ["-tissue_c", "0.36,lung="], ["-tissue_c (lung) takes a number (kPa), not ''"]),
+        "only a sign of equality": (good + ["-tissue_c", "="], ["-tissue_c", "begins with the value"]),
+        "a value that is no number for a part": (good + ["-tissue_c", "0.36,lung=nan"], ["-tissue_c (lung) takes a number", "'nan'"]),
+        "a value out of range for a part": (good + ["-tissue_c", "0.36,lung=-1"],
+                                            ["-tissue_c (lung) -1 (kPa) is out of range", "> 0"]),
+        "a value out of range beside a part": (good + ["-tissue_c", "0,lung=1"], ["-tissue_c 0 (kPa) is out of range"]),
+        "a part twice": (good + ["-tissue_c", "0.36,lung=1,lung=2"], ["-tissue_c names 'lung' twice"]),
+        "parts that overlap": (with_mesh(m["overlapping_parts"]) + ["-tissue_c", "0.36,lung=1,half=2"],
+                               ["-tissue_c", "'lung' and 'half' share cells", "do not overlap"]),
+        "a surface where nothing reads it": (good + ["-tissue_c", "0.36,airway=1"],
+                                             ["-tissue_c", "nothing reads it on surface 'airway'"]),
+        "another surface of an option of one": (good + ["-chest_wall_stiffness_pleura", "0.1,airway=0.2"],
+                                                ["-chest_wall_stiffness_pleura", "nothing reads it on surface 'airway'"]),
+        "a part of a number that is no parameter": (good + ["-ventilator_pip", "6,lung=7"],
+                                                    ["-ventilator_pip takes one number", "no parameter of a tissue law"]),
+        "a part of an option of another law": (good + ["-tissue", "yoshihara", "-tissue_c1", "1,lung=2"], ["-tissue_c1"]),
+        "no file of values": (good + ["-tissue_c", missing + ":c"], ["-tissue_c", missing + ":c", "no such file"]),
+        "a mesh for a file of values": (good + ["-tissue_c", m["good"] + ":c"], ["-tissue_c", "not HDF5", "FILE.h5:dataset"]),
+        "no dataset of that name": (good + ["-tissue_c", listed[:-4] + "c"], ["-tissue_c", "no such dataset; it has some"]),
+        "values of another mesh": (good + values("few", some[1:]), ["-tissue_c", "99 values", m["good"], "100 tetrahedra"]),
+        "a value that is no number in a dataset": (good + values("nan", np.where(np.arange(100) == 7, np.nan, some)),
+                                                   ["-tissue_c", "value 7, counted from 0, is nan"]),
+        "a value out of range in a dataset": (good + values("zero", np.where(np.arange(100) == 99, 0, some)),
+                                              ["-tissue_c", "value 99", "is 0 (kPa)", "> 0"]),
+        "a dataset of vectors": (good + values("vectors", np.ones((100, 3))), ["-tissue_c", "2 dimensions"]),
+        "a dataset of text": (good + values("words", ["stiff"] * 100), ["-tissue_c", "holds no numbers"]),
+        "an empty dataset": (good + values("empty", np.zeros(0)), ["-tissue_c", "is empty"]),
+        "a dataset for a number that is no parameter": (good + values("pip", some, "-ventilator_pip"),
+                                                        ["-ventilator_pip takes one number"]),
         # surfaces
         "unknown surface of the springs": (good + ["-chest_wall_surfaces", "pleura,trachea"],
                                            ["'trachea'", "-chest_wall_surfaces", "airway, pleura"]),
@@ -633,7 +685,8 @@ class InputErrors(unittest.TestCase):
                   "a surface within the volume", "mesh of no names", "missing airway",
                   "missing mesh", "junk mesh", "a facet of no cell", "a torn mesh", "missing programme", "empty programme",
                   "a wrong line", "nothing holds the lung", "nothing holds one of two bodies",
-                  "output where a file is", "output below a file"}
+                  "output where a file is", "output below a file", "parts that overlap", "values of another mesh",
+                  "a value that is no number in a dataset"}
         self.assertLessEqual(shared, set(self.table))
         self.run_table(2, [name for i, name in enumerate(self.table) if i % 2 or name in shared])
 

@@ -263,13 +263,13 @@ class Tools(unittest.TestCase):
         files = {"scene.opts": f'-options_file "{folder}/inner.opts"\n-progress off\n',
                  "inner.opts": f"# more\n-options_file_yaml {folder}/deep.yaml\n-ventilator_programme {folder}/breath.txt\n",
                  "deep.yaml": f"dm_plex_filename: {folder}/lung.msh\ntissue_porosity: {folder}/field.h5:porosity\n",
-                 "breath.txt": "in 1 pressure 5\n", "lung.msh": "cells\n", "field.h5": "values\n", "asked.txt": "by PETSC_OPTIONS\n",
+                 "breath.txt": "in 1 pressure 5\n", "lung.msh": "cells\n", "field.h5": "values\n", "cells.h5": "more\n", "asked.txt": "by PETSC_OPTIONS\n",
                  ".petscrc": f"-options_file {folder}/more.opts\n", "more.opts": "-snes_rtol 1e-3\n", "program": "#!/bin/sh\n",
                  "unasked.txt": ""}
         for name, text in files.items():
             (folder / name).write_text(text)
         (folder / "program").chmod(0o755)
-        command = [folder / "program", "-options_file", folder / "scene.opts", "-output_dir"]
+        command = [folder / "program", "-options_file", folder / "scene.opts", "-tissue_c", f"{folder}/cells.h5:group/c", "-output_dir"]
         environment = {"PATH": os.environ["PATH"], "HOME": "/nowhere", "PETSC_OPTIONS": f"-x {folder}/asked.txt", "LANG": "C"}
 
         def key(**more):

@@ -41,11 +41,13 @@ def is_option_file(before, word):
 
 
 def files_of(words, directory, found=None):
-    """All files that words name, seen from a directory, and those that the option files among them name, in the order in which they
-    are met."""
+    """All files that words name, also as FILE:dataset, seen from a directory, and those that the option files among them name, in the
+    order in which they are met."""
     found = {} if found is None else found
     for before, word in zip([None, *words], words):
         path = os.path.realpath(os.path.join(directory, word))
+        if not os.path.isfile(path):
+            path = os.path.realpath(os.path.join(directory, word.rpartition(":")[0]))
         if path in found or not os.path.isfile(path):
             continue
         found[path] = None

@@ -6,6 +6,8 @@
 #include "pulmo/base/petsc.hpp"
 
 #include <limits>
+#include <map>
+#include <memory>
 #include <set>
 #include <string>
 #include <utility>
@@ -47,7 +49,8 @@ public:
   /// option given for it is an error that quotes @p enabled_by.
   void group(const std::string &name, const std::string &about, bool in_use = true, const std::string &enabled_by = "");
 
-  /// Also `0.36,right=0.7`: one number, and others for named parts of the mesh (varying(); @p value is the first).
+  /// Also `0.36,right=0.7`: one number, and others for named parts of the mesh (varying(); @p value is the first). Or
+  /// `FILE.h5:dataset`: a number for each tetrahedron of the mesh file (@p value is their mean).
   PetscErrorCode real(const std::string &name, const std::string &unit, Range range, const std::string &help,
                       PetscReal &value);
   PetscErrorCode whole(const std::string &name, const std::string &unit, Range range, const std::string &help,
@@ -71,11 +74,15 @@ public:
     const PetscReal *target = nullptr;
     PetscReal everywhere = 0;
     std::vector<std::pair<std::string, PetscReal>> by_name;
-    bool surfaces = true; ///< names may be those of surfaces
+    bool surfaces = true;                               ///< names may be those of surfaces
+    bool by_cell = false;                               ///< a dataset tells
+    std::shared_ptr<const std::vector<double>> of_cell; ///< in the order of the mesh file; rank 0 alone has them
   };
   /// Those read so far; ParameterFields finds a place for each, or refuses it.
   const std::vector<Varying> &varying() const { return varying_; }
   bool varies(const PetscReal &value) const;
+  /// Whether a dataset tells any of them, so that cells must know their number in the mesh file.
+  bool varies_by_cell() const;
   /// What was read into @p from, a default of others, goes to @p to, too; call drop_varying(from) at the end.
   void hand_down(const PetscReal &from, PetscReal &to);
   void drop_varying(const PetscReal &value);
@@ -120,6 +127,10 @@ public:
   PetscErrorCode all_used(OptionList &list) const;
   /// The first half of it: pulmo's own.
   OptionList own_used() const;
+  /// Notes what an option says whose value names a file, and puts that in place of the value in a list: a file may
+  /// move, or hold something else the next time.
+  void note_content(const std::string &name, const std::string &content) { content_[name] = content; }
+  OptionList by_content(OptionList list) const;
   /// Whether an option of pulmo's own has its default value.
   bool at_default(const std::string &name) const;
   /// Whether two values of an option say the same: 1e4 and 10000, on and true.
@@ -146,6 +157,8 @@ private:
                               const Range &range, double &value) const;
   PetscErrorCode parse_varying(const std::string &option, const std::string &raw, const std::string &unit,
                                const Range &range, PetscReal &value);
+  PetscErrorCode parse_dataset(const std::string &option, const std::string &raw, const std::string &unit,
+                               const Range &range, PetscReal &value);
   std::string full(const std::string &name) const;
   /// The declared option, or PETSc's option that pulmo knows, whose name is nearest; empty if all are further away
   /// than @p most letters.
@@ -158,6 +171,7 @@ private:
   std::vector<Group> groups_;
   std::vector<Declared> declared_;
   std::vector<Varying> varying_;
+  std::map<std::string, std::string> content_;
   OptionList sources_;
   std::set<std::string> told_; ///< options of which warn_unused() has warned
 };

@@ -58,6 +58,12 @@ public:
   /// volume outside what any lung has betrays the wrong unit.
   PetscErrorCode read(const Options &options, bool ventilated);
 
+  /// For each cell of this rank, counted from 0, the number of its tetrahedron in the mesh file; with -dm_refine that
+  /// of the tetrahedron it is a piece of. Empty unless the options of read() vary by cell.
+  const std::vector<PetscInt> &places_in_file() const { return places_; }
+  /// Tetrahedra of the mesh file.
+  PetscInt tetrahedra_in_file() const { return tetrahedra_; }
+
   DM dm() const { return dm_; }
   const std::string &file() const { return file_; }
   PetscReal volume() const { return volume_; }   ///< mm^3, reference configuration
@@ -106,13 +112,18 @@ private:
   PetscErrorCode check_parts(MPI_Comm comm, PetscInt cells_in_file, PetscReal volume_of_file) const;
   PetscErrorCode check_cells(const Options &options);
   PetscErrorCode find_surfaces(const Options &options);
+  /// Labels that carry the number of each cell in the file through reordering, distribution and refinement.
+  PetscErrorCode label_places(const NamedMesh &file);
+  /// Reads these labels and takes them away.
+  PetscErrorCode read_places();
   std::string surface_names() const;
 
   DMHandle dm_;
   std::string file_;
   PetscReal scale_ = 1, volume_ = 0, length_ = 0;
   bool scale_given_ = false;
-  PetscInt cells_ = 0;
+  PetscInt cells_ = 0, tetrahedra_ = 0;
+  std::vector<PetscInt> places_;
   std::map<std::string, Surface> surfaces_;
   std::vector<std::string> prefer_;
   std::vector<Part> parts_;

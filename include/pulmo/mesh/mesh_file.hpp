@@ -36,7 +36,7 @@ struct MeshFile {
 
   std::vector<std::array<double, 3>> nodes; ///< as in the file, unscaled
   std::vector<long> node_tags;              ///< their numbers in the file; empty if it has none
-  std::vector<Element<4>> cells;            ///< left- or right-handed
+  std::vector<Element<4>> cells;            ///< left- or right-handed, in the order of the file
   std::vector<Element<3>> facets;
   std::vector<Group> groups;
 };
@@ -55,10 +55,13 @@ struct NamedMesh {
 
   std::vector<std::array<double, 3>> nodes; ///< unscaled; those of cells, in the order of their coordinates
   std::vector<std::array<int, 4>> cells;    ///< right-handed, in the order of their nodes
-  std::vector<std::array<int, 3>> facets;   ///< those with a name
-  std::vector<Part> parts;                  ///< facets first, in the order of their names
-  double volume = 0;                        ///< unscaled
-  std::vector<std::string> notes;           ///< what a user should know of it, in sentences
+  std::vector<int> place;                 ///< of each cell among the tetrahedra of the file (the first, if it is there
+                                          ///< more than once)
+  int tetrahedra = 0;                     ///< of the file
+  std::vector<std::array<int, 3>> facets; ///< those with a name
+  std::vector<Part> parts;                ///< facets first, in the order of their names
+  double volume = 0;                      ///< unscaled
+  std::vector<std::string> notes;         ///< what a user should know of it, in sentences
 };
 
 /// Makes @p mesh of @p file. A facet that carries several names gets the first of @p prefer that is among them. Returns

@@ -19,8 +19,9 @@ class ParameterFields {
 public:
   /// Finds where among the constants of @p composition the parameters are that Options::varying() lists, and the cells
   /// and surfaces that they name. User errors: a number that is no parameter of a kernel, a name that the mesh has not,
-  /// two names that share cells, a surface on which nothing reads the parameter. Collective.
-  PetscErrorCode setup(const Options &options, const Composition &composition);
+  /// two names that share cells, a surface on which nothing reads the parameter, a dataset of another length.
+  /// Collective. Notes in @p options what datasets say, whatever the order of cells and their numbers.
+  PetscErrorCode setup(Options &options, const Composition &composition);
 
   bool empty() const { return entries_.empty(); }
   /// How many constants differ from place to place.
@@ -40,6 +41,9 @@ private:
     std::map<std::string, PetscReal> of_surface;
   };
 
+  PetscErrorCode name_parts(MPI_Comm comm, const Composition &composition, const char *owner,
+                            const Options::Varying &varying, const std::vector<Mesh::Region> &regions, Entry &entry);
+  PetscErrorCode take_dataset(Options &options, const Mesh &mesh, const Options::Varying &varying, Entry &entry);
   PetscReal value(const Entry &entry, PetscInt cell, const std::string &surface) const;
 
   std::vector<Entry> entries_;
