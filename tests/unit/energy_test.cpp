@@ -71,6 +71,8 @@ std::vector<Case> cases()
                          "-lumen_pressure -lumen_pressure_surfaces airway,pleura "
                          "-ventilator_peep 2 -chest_wall_stiffness_pleura 0.2 -traction -traction_surfaces airway "
                          "-traction_value 0.1,-0.05,0.2 "});
+  list.push_back(
+      {"springs that differ by surface", breath + gas + "-chest_wall -chest_wall_stiffness 0.08,airway=0.5 "});
   list.push_back({"loads only", "-ts_max_time 0.4 " + gas + springs +
                                     "-traction -traction_surfaces airway "
                                     "-traction_value 0.1,-0.05,0.2 "});

@@ -3,6 +3,7 @@
 #include "unit/scenes.hpp"
 
 #include "pulmo/physics/effects/airflow.hpp"
+#include "verification/support/lattice.hpp"
 
 namespace pulmo::test {
 namespace {
@@ -303,6 +304,44 @@ TEST(WeakForm, EveryColumnOfTheJacobianForEveryLawAndAnyShift)
     }
 }
 
+/// Everything at once on a box of two halves; law, springs, permeability and a surface have values of their own.
+SceneSpec two_halves(bool airflow, const LatticeFile &mesh)
+{
+  SceneSpec scene = full_scene(airflow);
+  scene.chest_wall = "full";
+  scene.more = "-dm_plex_filename " + mesh.path() +
+               " -tissue_c 0.3567,right=1.9 -tissue_beta 1.075,left=0.6,right=2 -tissue_c1 0.2782,left=0"
+               " -chest_wall_stiffness 0.08,x0=0.02,right=0.31 -chest_wall_stiffness_z1 0.21,right=0";
+  if (airflow) scene.more += " -airflow_permeability 0.7,left=23";
+  return scene;
+}
+
+Lattice halves()
+{
+  Lattice box = Lattice::box({2, 1, 2}, {1, 1, 1});
+  box.part = [](const Lattice::Place &x) { return x[0] < 0.5 ? "left" : "right"; };
+  return box;
+}
+
+TEST(WeakForm, EveryColumnOfTheJacobianWithRegions)
+{
+  const LatticeFile mesh(halves());
+  for (bool airflow : {false, true})
+    for (const char *type : {"pulmo", "basic"}) {
+      SCOPED_TRACE(type);
+      SceneSpec scene = two_halves(airflow, mesh);
+      scene.more += std::string(" -petscfe_type ") + type;
+      const Registry registry = Registry::standard();
+      SceneRun run(registry);
+      State s;
+      PULMO_OK(prepare(run, scene.options()));
+      ASSERT_NE(run.model().composition().varying(), nullptr);
+      PULMO_OK(random_state(run, 320, s));
+      expect_jacobian(run, s, 2.3, 3e-8);
+      if (HasFatalFailure()) return;
+    }
+}
+
 TEST(WeakForm, EveryColumnOfTheJacobianWithDampedPressure)
 {
   SceneSpec scene = full_scene(true);
@@ -479,6 +518,12 @@ TEST(Integration, AgreesWithPetscForOtherElements)
       scene.more = std::string("-elements ") + pair;
       expect_same_integration(scene, 70, 1e-12);
     }
+}
+
+TEST(Integration, AgreesWithPetscForRegions)
+{
+  const LatticeFile mesh(halves());
+  for (bool airflow : {false, true}) expect_same_integration(two_halves(airflow, mesh), 51, 1e-12);
 }
 
 TEST(Integration, AgreesWithPetscForOtherDegreesOfQuadrature)

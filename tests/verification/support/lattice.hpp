@@ -26,6 +26,8 @@ public:
   std::function<Place(const Place &)> map = [](const Place &x) { return x; };     ///< to coordinates, mm
   /// Name of the boundary triangle whose centre is there.
   std::function<std::string(const Place &)> name = face_of_box;
+  /// Name of the volume of the tetrahedron whose centre is there.
+  std::function<std::string(const Place &)> part = [](const Place &) { return "body"; };
 
   static std::string face_of_box(const Place &x)
   {
@@ -169,11 +171,20 @@ public:
         for (int d = 0; d < 3; ++d) centre[d] += places[c][d] / 3;
       boundary.emplace_back(corners, tags.insert({lattice.name(centre), tags.size() + 1}).first->second);
     }
+    std::map<std::string, int> parts;
+    std::vector<int> part_of;
+    for (const auto &cell : cells) {
+      Lattice::Place centre{0, 0, 0};
+      for (int c : cell)
+        for (int d = 0; d < 3; ++d) centre[d] += places[c][d] / 4;
+      part_of.push_back(parts.insert({lattice.part(centre), tags.size() + parts.size() + 1}).first->second);
+    }
     std::ofstream out(path_);
     out.precision(17);
-    out << "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$PhysicalNames\n" << tags.size() + 1 << "\n";
+    out << "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$PhysicalNames\n" << tags.size() + parts.size() << "\n";
     for (const auto &[name, tag] : tags) out << "2 " << tag << " \"" << name << "\"\n";
-    out << "3 " << tags.size() + 1 << " \"body\"\n$EndPhysicalNames\n$Nodes\n" << places.size() << "\n";
+    for (const auto &[name, tag] : parts) out << "3 " << tag << " \"" << name << "\"\n";
+    out << "$EndPhysicalNames\n$Nodes\n" << places.size() << "\n";
     for (std::size_t i = 0; i < places.size(); ++i) {
       const Lattice::Place x = lattice.map(places[i]);
       out << i + 1 << " " << x[0] << " " << x[1] << " " << x[2] << "\n";
@@ -185,9 +196,9 @@ public:
       for (int c : corners) out << " " << c + 1;
       out << "\n";
     }
-    for (const auto &cell : cells) {
-      out << ++element << " 4 2 " << tags.size() + 1 << " " << tags.size() + 1;
-      for (int c : cell) out << " " << c + 1;
+    for (std::size_t i = 0; i < cells.size(); ++i) {
+      out << ++element << " 4 2 " << part_of[i] << " " << part_of[i];
+      for (int c : cells[i]) out << " " << c + 1;
       out << "\n";
     }
     out << "$EndElements\n";
