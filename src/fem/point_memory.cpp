@@ -37,7 +37,7 @@ PetscErrorCode PointMemory::evaluate(PetscReal t, const PetscScalar *x, const Pe
 {
   PetscSection section;
   PetscInt size = 0;
-  std::vector<Sample> now, rates;
+  std::vector<PointSample> now, rates;
 
   PetscFunctionBeginUser;
   PetscCall(DMGetLocalSection(model_->dm(), &section));

@@ -150,14 +150,14 @@ PetscErrorCode Sampling::surface(const Mesh &mesh, const std::string &name, std:
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-void Sampling::sample(const Element &e, const PetscScalar *x, std::vector<Sample> &samples) const
+void Sampling::sample(const Element &e, const PetscScalar *x, std::vector<PointSample> &samples) const
 {
   const Table &t = tables_[e.table];
   const PetscInt *dofs = assembly_->cell_dofs(e.cell);
 
   samples.resize(t.weights.size());
   for (std::size_t q = 0; q < samples.size(); ++q) {
-    Sample &s = samples[q];
+    PointSample &s = samples[q];
     PetscScalar A[9] = {0}, H[9], b[3] = {0, 0, 0};
     for (int d = 0; d < 3; ++d) {
       s.u[d] = s.grad_p[d] = s.u_t[d] = s.grad_p_t[d] = 0;
@@ -187,7 +187,7 @@ void Sampling::sample(const Element &e, const PetscScalar *x, std::vector<Sample
   }
 }
 
-void Sampling::make_rates(const Sample &before, PetscReal dt, Sample &now)
+void Sampling::make_rates(const PointSample &before, PetscReal dt, PointSample &now)
 {
   for (int i = 0; i < 9; ++i) now.state.H_rate[i] = (now.state.H[i] - before.state.H[i]) / dt;
   for (int d = 0; d < 3; ++d) {

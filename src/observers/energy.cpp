@@ -124,7 +124,7 @@ PetscErrorCode EnergyAudit::persist(Archive &archive, Vec local)
 
 PetscErrorCode EnergyAudit::integrate(const Part &part, const StepReport &step, std::vector<double> &sums)
 {
-  std::vector<Sample> now, before;
+  std::vector<PointSample> now, before;
   const PetscReal t = step.row.time, dt = step.row.dt;
   Step step_now(dt), step_before(dt);
 

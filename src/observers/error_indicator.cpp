@@ -235,7 +235,7 @@ PetscErrorCode ErrorIndicator::estimate(Vec local, CellErrors &errors)
   const bool gas = scene_.facts().airflow;
   const TissueLaw &law = scene_.tissue().law();
   const auto &cells = sampling_.cells();
-  std::vector<Sample> samples;
+  std::vector<PointSample> samples;
   std::vector<PetscScalar> stresses, gradients;
   const Step second; // the densities of a step of 1 s are powers
 
@@ -273,7 +273,7 @@ PetscErrorCode ErrorIndicator::estimate(Vec local, CellErrors &errors)
     const auto &weights = sampling_.weights(e);
     sampling_.sample(e, x.data(), samples);
     for (std::size_t q = 0; q < weights.size(); ++q) {
-      Sample &s = samples[q];
+      PointSample &s = samples[q];
       const auto lambda = barycentric(e, s.x);
       const PetscReal w = weights[q] * e.measure * units::j_per_kPa_mm3, w_stress = w / (2 * model_.modulus());
       PetscScalar P[9], error[9];

@@ -32,7 +32,7 @@ PetscErrorCode GravityAudit::setup()
   double ends[2]; // least height and least depth
   std::array<double, n_thirds + 4> sums{};
   VecHandle rest;
-  std::vector<Sample> samples;
+  std::vector<PointSample> samples;
 
   PetscFunctionBeginUser;
   middle_ = 0;
@@ -79,7 +79,7 @@ PetscErrorCode GravityAudit::setup()
 PetscErrorCode GravityAudit::observe(const StepReport &step)
 {
   std::array<double, n_thirds + 1> sums{};
-  std::vector<Sample> samples;
+  std::vector<PointSample> samples;
   Row row;
 
   PetscFunctionBeginUser;

@@ -87,7 +87,7 @@ PetscErrorCode RegionAudit::observe(const StepReport &step)
   const double airway = step.row.pressure * units::kPa_per_cmH2O;
   const bool gas = scene_.facts().airflow;
   std::vector<double> sums(volumes_.size() * n_moments, 0);
-  std::vector<Sample> samples;
+  std::vector<PointSample> samples;
   std::vector<RegionState> states(volumes_.size());
 
   PetscFunctionBeginUser;

@@ -140,7 +140,7 @@ PetscErrorCode look_at_tissue(const Scene &scene, const Model &model, Vec local,
   PetscReal sums[12] = {0}; // Grad u, J - 1, lost volume, volume
   PointState state;
   Sampling sampling;
-  std::vector<Sample> samples;
+  std::vector<PointSample> samples;
 
   PetscFunctionBeginUser;
   make_point_state(zero, nullptr, state);

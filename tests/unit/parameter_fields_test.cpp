@@ -118,11 +118,11 @@ TEST(ParameterFields, OffCostsNothing)
   PULMO_OK(prepare(run, mesh.options() + airflow + "-tissue_c 1.5"));
   EXPECT_EQ(run.model().composition().varying(), nullptr);
   EXPECT_TRUE(run.scene().mesh().places_in_file().empty());
-  VaryingConstants *varying;
+  PlaceData *places;
   PetscDS ds;
   PULMO_OK(DMGetDS(run.model().dm(), &ds));
-  PULMO_OK(VaryingConstants::find(ds, &varying));
-  EXPECT_EQ(varying, nullptr); // what the integrator asks for
+  PULMO_OK(PlaceData::find(ds, &places));
+  EXPECT_EQ(places, nullptr); // what the integrator asks for
 }
 
 TEST(ParameterFields, TheSameValueByNameChangesNoBit)

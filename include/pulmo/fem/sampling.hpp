@@ -7,7 +7,7 @@
 namespace pulmo {
 
 /// A state at one point.
-struct Sample {
+struct PointSample {
   PointState state;
   PetscReal x[3];                       ///< material coordinates, mm
   PetscScalar u[3];                     ///< mm
@@ -37,11 +37,11 @@ public:
   /// Weights of the points of @p element, summing to its measure when multiplied with it.
   const std::vector<PetscReal> &weights(const Element &element) const { return tables_[element.table].weights; }
   /// States at the points of @p element for the local vector @p x.
-  void sample(const Element &element, const PetscScalar *x, std::vector<Sample> &samples) const;
+  void sample(const Element &element, const PetscScalar *x, std::vector<PointSample> &samples) const;
   /// Gives @p now the rates that backward Euler finds in it after @p before, @p dt seconds earlier.
-  static void make_rates(const Sample &before, PetscReal dt, Sample &now);
+  static void make_rates(const PointSample &before, PetscReal dt, PointSample &now);
   /// A sample as kernels see it.
-  Point point(const Sample &sample, const Element &element, PetscReal t, const Step &step,
+  Point point(const PointSample &sample, const Element &element, PetscReal t, const Step &step,
               const Memory &memory = {}) const
   {
     return {sample.state, sample.u,   sample.p,   gas_ ? sample.grad_p : nullptr,   t,     0, sample.x, element.normal,

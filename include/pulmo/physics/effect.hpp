@@ -405,7 +405,8 @@ public:
   virtual const char *name() const = 0;
   /// One line for -help and the ledger: what it is and where it is published.
   virtual const char *about() const = 0;
-  /// Options that bring it into a scene of a lung with the surfaces pleura and airway. The harness checks it with these.
+  /// Options that bring it into a scene of a lung with the surfaces pleura and airway. The harness checks it with
+  /// these.
   virtual std::string example() const { return std::string("-") + name(); }
   /// Declares all options, whether or not the scene asks for the effect, and learns whether it does.
   virtual PetscErrorCode declare(Options &options) = 0;

@@ -8,8 +8,8 @@
 #include "verification/support/integrators.hpp"
 #include "verification/support/scene_parts.hpp"
 
-#include "pulmo/observers/clinical.hpp"
 #include "pulmo/base/units.hpp"
+#include "pulmo/observers/clinical.hpp"
 
 #include <cmath>
 #include <filesystem>

@@ -1,11 +1,12 @@
 /// @file
-/// True errors of a computed state in the norms of the error indicators, as pulmo/observers/error_indicator.hpp defines them.
+/// True errors of a computed state in the norms of the error indicators, as pulmo/observers/error_indicator.hpp defines
+/// them.
 #pragma once
 
 #include "verification/support/fields.hpp"
 
-#include "pulmo/physics/tissue_law.hpp"
 #include "pulmo/base/units.hpp"
+#include "pulmo/physics/tissue_law.hpp"
 
 namespace pulmo::test {
 
