@@ -243,7 +243,9 @@ PetscErrorCode Simulation::run(bool &finished)
     }
   }
   if (finished) {
-    finished = balance_.judge_run(scene_.facts().airflow ? worst_balance_ : 0);
+    bool alone;
+    PetscCall(airway_alone(alone));
+    finished = balance_.judge_run(alone ? worst_balance_ : 0);
     if (!finished)
       PetscCall(end_unsolved("the run was not solved", balance_.complaint()));
     else if (balance_.worst() > Balance::warning)
@@ -256,6 +258,17 @@ PetscErrorCode Simulation::run(bool &finished)
   seconds_.total = end - begin + seconds_.setup;
   seconds_.solve = end - begin - seconds_.residual - seconds_.jacobian - seconds_.output;
   PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &seconds_, 6, MPI_DOUBLE, MPI_MAX, comm));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Whether gas gets in and out by the airway and nowhere else: no source, and no other node of prescribed pressure.
+PetscErrorCode Simulation::airway_alone(bool &alone)
+{
+  PetscReal force, gas = 0;
+
+  PetscFunctionBeginUser;
+  if (scene_.facts().airflow) PetscCall(model_.loads(accepted_.time, before_, local_residual_, force, gas));
+  alone = scene_.facts().airflow && gas == 0;
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -273,17 +273,17 @@ class Programmes(unittest.TestCase):
     def test_own_steps_after_a_restart(self):
         options = CUBE + pulmo.TIGHT + pulmo.programme(self.TEXT) + ["-checkpoint_every", "0.3"]
         whole = pulmo.finished(options)
-        part = pulmo.finished(options + ["-ts_max_time", "0.35"])
-        rest = pulmo.finished(options + ["-restart", part.path("checkpoint_previous.h5")])
+        part = pulmo.finished(options + ["-ts_max_time", "0.35"])  # its checkpoint is of 0.3 s, before the step that is cut
+        rest = pulmo.finished(options + ["-restart", part.path("checkpoint.h5")])
         for column in ("time_s", "dt_s", "volume_ml", "airway_pressure_cmH2O"):
             np.testing.assert_allclose(rest.signals()[column], whole.signals()[column], rtol=0, atol=1e-9)
         # -ts_dt may change; steps of a phase that began before the checkpoint are part of the scene
-        faster = pulmo.finished(options + ["-restart", part.path("checkpoint_previous.h5"), "-ts_dt", "0.02"]).signals()
+        faster = pulmo.finished(options + ["-restart", part.path("checkpoint.h5"), "-ts_dt", "0.02"]).signals()
         dts = {p: max(h for h, q in zip(faster["dt_s"], faster["phase"]) if q == p) for p in ("plateau", "expiration")}
         self.assertAlmostEqual(dts["plateau"], 0.1, places=9)
         self.assertAlmostEqual(dts["expiration"], 0.02, places=9)
         other = pulmo.Case(options + pulmo.programme(self.TEXT.replace("dt 0.01", "dt 0.02")) + [
-            "-restart", part.path("checkpoint_previous.h5")])
+            "-restart", part.path("checkpoint.h5")])
         self.assertNotEqual(other.code, 0)
         self.assertIn("phase 1 of the ventilator", other.err)
 

@@ -24,7 +24,6 @@ _scratch = tempfile.TemporaryDirectory(prefix="pulmo_case_")
 
 ENVIRONMENT = dict(os.environ, OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1", OMPI_ALLOW_RUN_AS_ROOT="1",
                    OMPI_ALLOW_RUN_AS_ROOT_CONFIRM="1",
-                   OMPI_MCA_ess_singleton_isolated="1",  # no daemon beside a run without mpiexec
                    # several tests share the cores
                    OMPI_MCA_hwloc_base_binding_policy="none", OMPI_MCA_mpi_yield_when_idle="1")
 

@@ -109,6 +109,7 @@ private:
   void begin_smooth_stretch();
   /// Step size from time @p t, shortened to land on the end of the ramp or of the phase.
   PetscReal landing(PetscReal t) const;
+  PetscErrorCode airway_alone(bool &alone);
   PetscErrorCode make_rate();
   PetscErrorCode local_residual(PetscReal t);
   PetscErrorCode scatter(PetscReal t, Vec X, Vec Xdot);
