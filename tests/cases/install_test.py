@@ -49,8 +49,15 @@ class Install(unittest.TestCase):
                       ["--build", build]):
             run = call(CMAKE, *words)
             self.assertEqual(run.returncode, 0, run.stdout)
-        self.assertEqual(self.finished(os.path.join(build, "consumer"), pulmo.scratch()),
-                         self.finished(self.path("bin/pulmo"), pulmo.scratch()))
+        # kernels in headers are compiled once more, with the project's own flags: the last digit may be another
+        theirs, ours = (self.finished(program, pulmo.scratch()).splitlines() for program in
+                        (os.path.join(build, "consumer"), self.path("bin/pulmo")))
+        self.assertEqual(len(theirs), len(ours))
+        self.assertEqual(theirs[0], ours[0])
+        for row, own in zip(theirs[1:], ours[1:]):
+            for value, expected in zip(row.split(","), own.split(","), strict=True):
+                if value != expected:
+                    self.assertAlmostEqual(float(value) / float(expected), 1, delta=1e-12)
 
     def test_the_program_finds_its_libraries_and_tools_find_the_program(self):
         def run_path(program):
