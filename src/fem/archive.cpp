@@ -244,6 +244,25 @@ PetscErrorCode Archive::numbers(const std::string &name, std::size_t &n, std::ve
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode Archive::rows_on_root(const std::string &name, std::size_t width, std::vector<double> &values)
+{
+  bool good = true;
+
+  PetscFunctionBeginUser;
+  if (!reading_) {
+    if (root_)
+      good_ = good_ && write_dataset(file_, name, H5T_NATIVE_DOUBLE, {values.size() / width, width}, values.data());
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+  if (root_) {
+    const QuietHdf5 quiet;
+    std::vector<hsize_t> shape;
+    good = read_dataset(file_, name, H5T_NATIVE_DOUBLE, shape, values) && shape.size() == 2 && shape[1] == width;
+  }
+  PetscCall(check_root(good, name));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode Archive::local(const std::string &name, Vec x)
 {
   const auto &fields = model_.composition().fields();
@@ -252,22 +271,11 @@ PetscErrorCode Archive::local(const std::string &name, Vec x)
   for (std::size_t f = 0; f < fields.size(); ++f) {
     const auto field = static_cast<PetscInt>(f);
     const std::string dataset = name + "/" + fields[f].name;
-    const auto width = static_cast<hsize_t>(fields[f].components);
     std::vector<double> values;
-    if (!reading_) {
-      PetscCall(order_.gather(field, x, values));
-      if (root_)
-        good_ =
-            good_ && write_dataset(file_, dataset, H5T_NATIVE_DOUBLE, {values.size() / width, width}, values.data());
-      continue;
-    }
-    bool good = true;
-    if (root_) {
-      const QuietHdf5 quiet;
-      std::vector<hsize_t> shape;
-      good = read_dataset(file_, dataset, H5T_NATIVE_DOUBLE, shape, values) && shape.size() == 2 && shape[1] == width;
-    }
-    PetscCall(check_root(good, dataset));
+    bool good;
+    if (!reading_) PetscCall(order_.gather(field, x, values));
+    PetscCall(rows_on_root(dataset, static_cast<std::size_t>(fields[f].components), values));
+    if (!reading_) continue;
     PetscCall(order_.scatter(field, values, x, good));
     PetscCall(check(good, dataset));
   }
@@ -277,21 +285,13 @@ PetscErrorCode Archive::local(const std::string &name, Vec x)
 PetscErrorCode Archive::cells(const std::string &name, std::size_t width, std::vector<double> &values)
 {
   std::vector<double> all;
-  bool good = true;
+  bool good;
 
   PetscFunctionBeginUser;
   if (!cell_order_.ready()) PetscCall(cell_order_.setup(model_.dm()));
-  if (!reading_) {
-    PetscCall(cell_order_.gather(width, values, all));
-    if (root_) good_ = good_ && write_dataset(file_, name, H5T_NATIVE_DOUBLE, {all.size() / width, width}, all.data());
-    PetscFunctionReturn(PETSC_SUCCESS);
-  }
-  if (root_) {
-    const QuietHdf5 quiet;
-    std::vector<hsize_t> shape;
-    good = read_dataset(file_, name, H5T_NATIVE_DOUBLE, shape, all) && shape.size() == 2 && shape[1] == width;
-  }
-  PetscCall(check_root(good, name));
+  if (!reading_) PetscCall(cell_order_.gather(width, values, all));
+  PetscCall(rows_on_root(name, width, all));
+  if (!reading_) PetscFunctionReturn(PETSC_SUCCESS);
   PetscCall(cell_order_.scatter(width, all, values, good));
   PetscCall(check(good, name));
   PetscFunctionReturn(PETSC_SUCCESS);

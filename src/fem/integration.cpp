@@ -780,10 +780,6 @@ PetscErrorCode create_fe(PetscFE fe)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-} // namespace
-
-namespace {
-
 constexpr const char *log_name = "pulmo_integration_log", *places_name = "pulmo_places";
 
 PetscErrorCode attach_pointer(PetscDS ds, const char *name, void *pointer)
@@ -798,14 +794,16 @@ PetscErrorCode attach_pointer(PetscDS ds, const char *name, void *pointer)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode find_pointer(PetscDS ds, const char *name, void **pointer)
+template <class T>
+PetscErrorCode find_pointer(PetscDS ds, const char *name, T **pointer)
 {
   PetscContainer container;
+  void *found = nullptr;
 
   PetscFunctionBeginUser;
-  *pointer = nullptr;
   PetscCall(PetscObjectQuery((PetscObject)ds, name, (PetscObject *)&container));
-  if (container) PetscCall(PetscContainerGetPointer(container, pointer));
+  if (container) PetscCall(PetscContainerGetPointer(container, &found));
+  *pointer = static_cast<T *>(found);
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -818,12 +816,7 @@ PetscErrorCode IntegrationLog::attach(PetscDS ds, IntegrationLog *log)
 
 PetscErrorCode IntegrationLog::find(PetscDS ds, IntegrationLog **log)
 {
-  void *pointer;
-
-  PetscFunctionBeginUser;
-  PetscCall(find_pointer(ds, log_name, &pointer));
-  *log = static_cast<IntegrationLog *>(pointer);
-  PetscFunctionReturn(PETSC_SUCCESS);
+  return find_pointer(ds, log_name, log);
 }
 
 PetscErrorCode PlaceData::attach(PetscDS ds, PlaceData *places)
@@ -833,12 +826,7 @@ PetscErrorCode PlaceData::attach(PetscDS ds, PlaceData *places)
 
 PetscErrorCode PlaceData::find(PetscDS ds, PlaceData **places)
 {
-  void *pointer;
-
-  PetscFunctionBeginUser;
-  PetscCall(find_pointer(ds, places_name, &pointer));
-  *places = static_cast<PlaceData *>(pointer);
-  PetscFunctionReturn(PETSC_SUCCESS);
+  return find_pointer(ds, places_name, places);
 }
 
 PetscErrorCode register_fe_type()

@@ -48,12 +48,7 @@ PetscErrorCode PointMemory::evaluate(PetscReal t, const PetscScalar *x, const Pe
     sampling_.sample(e, start ? zero.data() : x, now);
     if (!start) sampling_.sample(e, rate, rates);
     for (PetscInt q = 0; q < points_; ++q) {
-      if (!start) {
-        std::copy_n(rates[q].state.H, 9, now[q].state.H_rate);
-        std::copy_n(rates[q].u, 3, now[q].u_t);
-        std::copy_n(rates[q].grad_p, 3, now[q].grad_p_t);
-        now[q].p_t = rates[q].p;
-      }
+      if (!start) Sampling::take_rates(rates[q], now[q]);
       const Point point = sampling_.point(now[q], e, t, step, start ? Memory() : at(e.cell, q));
       PetscScalar *value = &values[static_cast<std::size_t>((e.cell * points_ + q) * width_)];
       for (const MemorySpec &memory : model_->composition().memories())

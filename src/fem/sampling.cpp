@@ -2,6 +2,7 @@
 
 #include "pulmo/mesh/mesh.hpp"
 
+#include <algorithm>
 #include <cmath>
 #include <numeric>
 
@@ -195,6 +196,14 @@ void Sampling::make_rates(const PointSample &before, PetscReal dt, PointSample &
     now.grad_p_t[d] = (now.grad_p[d] - before.grad_p[d]) / dt;
   }
   now.p_t = (now.p - before.p) / dt;
+}
+
+void Sampling::take_rates(const PointSample &rate, PointSample &now)
+{
+  std::copy_n(rate.state.H, 9, now.state.H_rate);
+  std::copy_n(rate.u, 3, now.u_t);
+  std::copy_n(rate.grad_p, 3, now.grad_p_t);
+  now.p_t = rate.p;
 }
 
 } // namespace pulmo

@@ -108,6 +108,8 @@ public:
 private:
   Archive(const Model &model, const NodeOrder &order, bool reading);
   PetscErrorCode scalar(const std::string &name, double &number);
+  /// Rows of @p width numbers that rank 0 alone has, and reads.
+  PetscErrorCode rows_on_root(const std::string &name, std::size_t width, std::vector<double> &values);
   /// @p n rows, equally long.
   PetscErrorCode numbers(const std::string &name, std::size_t &n, std::vector<double> &values);
   /// The same as check(), but rank 0 alone knows.

@@ -40,6 +40,8 @@ public:
   void sample(const Element &element, const PetscScalar *x, std::vector<PointSample> &samples) const;
   /// Gives @p now the rates that backward Euler finds in it after @p before, @p dt seconds earlier.
   static void make_rates(const PointSample &before, PetscReal dt, PointSample &now);
+  /// Gives @p now the rates that the sample @p rate of a vector of rates holds.
+  static void take_rates(const PointSample &rate, PointSample &now);
   /// A sample as kernels see it.
   Point point(const PointSample &sample, const Element &element, PetscReal t, const Step &step,
               const Memory &memory = {}) const
