@@ -1,5 +1,7 @@
 #include "pulmo/fem/free_boundary.hpp"
 
+#include "pulmo/mesh/shared_points.hpp"
+
 #include <algorithm>
 #include <set>
 
@@ -10,25 +12,15 @@ namespace {
 /// The facets of one cell alone, over all ranks.
 PetscErrorCode outer_facets(DM dm, std::vector<PetscInt> &facets)
 {
-  PetscInt begin, end, point_end, roots;
-  PetscSF sf;
+  PetscInt begin, end, point_end;
 
   PetscFunctionBeginUser;
   PetscCall(DMPlexGetChart(dm, nullptr, &point_end));
   PetscCall(DMPlexGetHeightStratum(dm, 1, &begin, &end));
-  std::vector<PetscInt> cells(static_cast<std::size_t>(point_end), 0), sent;
+  std::vector<PetscInt> cells(static_cast<std::size_t>(point_end), 0);
   for (PetscInt f = begin; f < end; ++f) PetscCall(DMPlexGetSupportSize(dm, f, &cells[f]));
   const std::vector<PetscInt> here = cells;
-  PetscCall(DMGetPointSF(dm, &sf));
-  PetscCall(PetscSFGetGraph(sf, &roots, nullptr, nullptr, nullptr));
-  if (roots >= 0) {
-    sent = cells;
-    PetscCall(PetscSFReduceBegin(sf, MPIU_INT, sent.data(), cells.data(), MPI_SUM));
-    PetscCall(PetscSFReduceEnd(sf, MPIU_INT, sent.data(), cells.data(), MPI_SUM));
-    sent = cells;
-    PetscCall(PetscSFBcastBegin(sf, MPIU_INT, sent.data(), cells.data(), MPI_REPLACE));
-    PetscCall(PetscSFBcastEnd(sf, MPIU_INT, sent.data(), cells.data(), MPI_REPLACE));
-  }
+  PetscCall(combine_shared(dm, MPI_SUM, cells));
   facets.clear();
   for (PetscInt f = begin; f < end; ++f)
     if (cells[f] == 1 && here[f] == 1) facets.push_back(f);

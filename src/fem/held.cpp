@@ -1,5 +1,6 @@
 #include "pulmo/fem/held.hpp"
 
+#include "pulmo/mesh/shared_points.hpp"
 #include "pulmo/physics/parameter_fields.hpp"
 
 #include <algorithm>
@@ -538,21 +539,18 @@ PetscErrorCode check_prescribed_once(const Composition &composition)
   const auto &constraints = composition.constraints();
   constexpr PetscReal times[] = {0, 0.3, 1}; // s: constant values differ at once, others somewhere
   constexpr PetscReal rounding = 1e-12;
-  PetscInt point_end, roots, n_held = 0;
-  PetscSF sf;
+  PetscInt point_end, n_held = 0;
 
   PetscFunctionBeginUser;
   for (const Constraint &c : constraints) n_held += c.field == displacement && c.pinned_body < 0;
   if (n_held < 2) PetscFunctionReturn(PETSC_SUCCESS);
   PetscCall(DMPlexGetChart(dm, nullptr, &point_end));
-  PetscCall(DMGetPointSF(dm, &sf));
-  PetscCall(PetscSFGetGraph(sf, &roots, nullptr, nullptr, nullptr));
   // each point's first holder of a component, by the surfaces in turn, against the next
   std::vector<PetscInt> first(static_cast<std::size_t>(3 * point_end), -1);
   for (std::size_t k = 0; k < constraints.size(); ++k) {
     const Constraint &constraint = constraints[k];
     if (constraint.field != displacement || constraint.pinned_body >= 0) continue;
-    std::vector<PetscInt> held(static_cast<std::size_t>(point_end), 0), sent, facets;
+    std::vector<PetscInt> held(static_cast<std::size_t>(point_end), 0), facets;
     for (const PetscInt vertex : constraint.vertices) held[vertex] = 1;
     if (!constraint.surface.empty()) PetscCall(mesh.facets(constraint.surface, facets));
     for (const PetscInt facet : facets) {
@@ -561,14 +559,8 @@ PetscErrorCode check_prescribed_once(const Composition &composition)
       for (PetscInt i = 0; i < n; ++i) held[closure[2 * i]] = 1;
       PetscCall(DMPlexRestoreTransitiveClosure(dm, facet, PETSC_TRUE, &n, &closure));
     }
-    if (roots >= 0) { // an edge or vertex of a surface may be on a rank that has none of the surface's facets
-      sent = held;
-      PetscCall(PetscSFReduceBegin(sf, MPIU_INT, sent.data(), held.data(), MPI_MAX));
-      PetscCall(PetscSFReduceEnd(sf, MPIU_INT, sent.data(), held.data(), MPI_MAX));
-      sent = held;
-      PetscCall(PetscSFBcastBegin(sf, MPIU_INT, sent.data(), held.data(), MPI_REPLACE));
-      PetscCall(PetscSFBcastEnd(sf, MPIU_INT, sent.data(), held.data(), MPI_REPLACE));
-    }
+    // an edge or vertex of a surface may be on a rank that has none of the surface's facets
+    PetscCall(combine_shared(dm, MPI_MAX, held));
     struct {
       double difference;
       int rank;

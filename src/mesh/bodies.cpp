@@ -1,5 +1,6 @@
 // The connected bodies of a mesh: numbering, openings, regions, pins.
 #include "pulmo/mesh/mesh.hpp"
+#include "pulmo/mesh/shared_points.hpp"
 
 #include <algorithm>
 #include <array>
@@ -14,9 +15,8 @@ namespace {
 PetscErrorCode number_bodies(DM dm, PetscInt begin, PetscInt end, std::vector<PetscInt> &of)
 {
   const MPI_Comm comm = PetscObjectComm((PetscObject)dm);
-  PetscInt face_begin, face_end, point_end, roots, changed = 1, first = 0;
+  PetscInt face_begin, face_end, point_end, changed = 1, first = 0;
   const PetscInt n = end - begin;
-  PetscSF sf;
 
   PetscFunctionBeginUser;
   PetscCall(DMPlexGetChart(dm, nullptr, &point_end));
@@ -44,23 +44,16 @@ PetscErrorCode number_bodies(DM dm, PetscInt begin, PetscInt end, std::vector<Pe
   }
 
   // the least number of a cell spreads over each body, and through the shared faces over ranks
-  std::vector<PetscInt> least(static_cast<std::size_t>(n), PETSC_MAX_INT), at_face, sent;
+  std::vector<PetscInt> least(static_cast<std::size_t>(n), PETSC_MAX_INT), at_face;
   for (PetscInt c = 0; c < n; ++c) least[root(c)] = std::min(least[root(c)], first + c);
-  PetscCall(DMGetPointSF(dm, &sf));
-  PetscCall(PetscSFGetGraph(sf, &roots, nullptr, nullptr, nullptr));
-  while (changed && roots >= 0) {
+  while (changed) {
     changed = 0;
     at_face.assign(static_cast<std::size_t>(point_end), PETSC_MAX_INT);
     for (PetscInt face = face_begin; face < face_end; ++face) {
       PetscCall(cells_of(face, count, cells));
       if (count > 0) at_face[face] = least[root(cells[0] - begin)];
     }
-    sent = at_face;
-    PetscCall(PetscSFReduceBegin(sf, MPIU_INT, sent.data(), at_face.data(), MPI_MIN));
-    PetscCall(PetscSFReduceEnd(sf, MPIU_INT, sent.data(), at_face.data(), MPI_MIN));
-    sent = at_face;
-    PetscCall(PetscSFBcastBegin(sf, MPIU_INT, sent.data(), at_face.data(), MPI_REPLACE));
-    PetscCall(PetscSFBcastEnd(sf, MPIU_INT, sent.data(), at_face.data(), MPI_REPLACE));
+    PetscCall(combine_shared(dm, MPI_MIN, at_face));
     for (PetscInt face = face_begin; face < face_end; ++face) {
       PetscCall(cells_of(face, count, cells));
       if (count == 0) continue;
@@ -187,9 +180,8 @@ std::string Mesh::body_text(const Body &body) const
 PetscErrorCode Mesh::hinge(const std::vector<Body> &list, Hinge &found) const
 {
   const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
-  PetscInt begin, end, cell_begin, roots, point_end;
+  PetscInt begin, end, cell_begin, point_end;
   PetscMPIInt size;
-  PetscSF sf;
   std::vector<PetscInt> body_of;
 
   PetscFunctionBeginUser;
@@ -209,16 +201,8 @@ PetscErrorCode Mesh::hinge(const std::vector<Body> &list, Hinge &found) const
     }
     PetscCall(DMPlexRestoreTransitiveClosure(dm_, cell, PETSC_TRUE, &n, &closure));
   }
-  PetscCall(DMGetPointSF(dm_, &sf));
-  PetscCall(PetscSFGetGraph(sf, &roots, nullptr, nullptr, nullptr));
-  if (roots >= 0) { // what is at a vertex of other ranks, too, its owner knows
-    std::vector<PetscInt> sent = least;
-    PetscCall(PetscSFReduceBegin(sf, MPIU_INT, sent.data(), least.data(), MPI_MIN));
-    PetscCall(PetscSFReduceEnd(sf, MPIU_INT, sent.data(), least.data(), MPI_MIN));
-    sent = largest;
-    PetscCall(PetscSFReduceBegin(sf, MPIU_INT, sent.data(), largest.data(), MPI_MAX));
-    PetscCall(PetscSFReduceEnd(sf, MPIU_INT, sent.data(), largest.data(), MPI_MAX));
-  }
+  PetscCall(combine_shared(dm_, MPI_MIN, least));
+  PetscCall(combine_shared(dm_, MPI_MAX, largest));
   // the one of least coordinates, whatever the ranks are
   using Candidate = std::array<double, 5>;
   Candidate best{HUGE_VAL, 0, 0, -1, -1};

@@ -1,6 +1,7 @@
 #include "pulmo/mesh/openings.hpp"
 
 #include "pulmo/base/units.hpp"
+#include "pulmo/mesh/shared_points.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -28,25 +29,6 @@ PetscErrorCode facets_of(const Mesh &mesh, const std::vector<std::string> &names
   }
   std::sort(facets.begin(), facets.end());
   facets.erase(std::unique(facets.begin(), facets.end()), facets.end()); // a facet may have two names
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-/// Combines a value of every mesh point with those that other ranks have for the same point.
-PetscErrorCode combine(DM dm, MPI_Op op, std::vector<PetscInt> &values)
-{
-  PetscSF sf;
-  PetscInt roots;
-
-  PetscFunctionBeginUser;
-  PetscCall(DMGetPointSF(dm, &sf));
-  PetscCall(PetscSFGetGraph(sf, &roots, nullptr, nullptr, nullptr));
-  if (roots < 0) PetscFunctionReturn(PETSC_SUCCESS); // one rank
-  std::vector<PetscInt> sent = values;
-  PetscCall(PetscSFReduceBegin(sf, MPIU_INT, sent.data(), values.data(), op));
-  PetscCall(PetscSFReduceEnd(sf, MPIU_INT, sent.data(), values.data(), op));
-  sent = values;
-  PetscCall(PetscSFBcastBegin(sf, MPIU_INT, sent.data(), values.data(), MPI_REPLACE));
-  PetscCall(PetscSFBcastEnd(sf, MPIU_INT, sent.data(), values.data(), MPI_REPLACE));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -83,7 +65,7 @@ PetscErrorCode count_patches(DM dm, const std::vector<PetscInt> &facets, PetscIn
       }
     }
     shared = number;
-    PetscCall(combine(dm, MPI_MIN, shared));
+    PetscCall(combine_shared(dm, MPI_MIN, shared));
     changed = 0;
     for (const auto &edge : edges)
       for (PetscInt e : edge)
@@ -241,7 +223,7 @@ PetscErrorCode find_rim(const Mesh &mesh, const std::vector<std::string> &names,
     for (int e = 0; e < 3; ++e) ++here[edges[e]];
   }
   everywhere = here;
-  PetscCall(combine(dm, MPI_SUM, everywhere));
+  PetscCall(combine_shared(dm, MPI_SUM, everywhere));
   for (PetscInt e = 0; e < points; ++e) {
     const PetscInt *ends;
     if (here[e] != 1 || everywhere[e] != 1) continue;

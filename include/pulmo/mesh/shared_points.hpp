@@ -1,0 +1,14 @@
+/// @file
+/// What several ranks know of one mesh point, put together.
+#pragma once
+
+#include "pulmo/base/petsc.hpp"
+
+#include <vector>
+
+namespace pulmo {
+
+/// Combines @p values, one for each local mesh point, with those that other ranks have for the same points. Collective.
+PetscErrorCode combine_shared(DM dm, MPI_Op op, std::vector<PetscInt> &values);
+
+} // namespace pulmo
