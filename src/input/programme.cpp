@@ -2,6 +2,7 @@
 
 #include "pulmo/base/text_file.hpp"
 #include "pulmo/base/units.hpp"
+#include "pulmo/input/user_file.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -324,21 +325,10 @@ PetscErrorCode parse_programme(MPI_Comm comm, const std::string &file, const std
 PetscErrorCode read_programme(MPI_Comm comm, const std::string &option, const std::string &file,
                               std::vector<Phase> &phases)
 {
-  PetscMPIInt rank;
   std::string text;
-  bool readable = false;
 
   PetscFunctionBeginUser;
-  PetscCallMPI(MPI_Comm_rank(comm, &rank));
-  if (rank == 0) {
-    readable = read_text(file, static_cast<std::size_t>(largest_file) + 1, text);
-  }
-  PetscCall(from_root(comm, readable));
-  PulmoUserCheck(readable, comm, "cannot read %s (%s); check its name", file.c_str(), option.c_str());
-  PetscCall(from_root(comm, text));
-  PulmoUserCheck(text.size() <= static_cast<std::size_t>(largest_file), comm,
-                 "%s (%s) has more than %ld MB: it is no programme; check its name", file.c_str(), option.c_str(),
-                 largest_file >> 20);
+  PetscCall(read_user_file(comm, option, file, largest_file, "programme", text));
   PetscCall(parse_programme(comm, file, text, phases));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
