@@ -311,11 +311,12 @@ PetscErrorCode Archive::global(const std::string &name, Vec X)
     PetscCall(VecZeroEntries(X));
     PetscCall(DMLocalToGlobal(dm, x, INSERT_VALUES, X));
   }
-  if (model_.composition().common_gas_pressure()) { // it has no node
-    PetscReal gas = 0;
-    if (!reading_) PetscCall(model_.carrier_value(X, gas));
-    PetscCall(value(name + "/gas_pressure", gas));
-    if (reading_) PetscCall(model_.set_carrier_value(X, gas));
+  if (model_.composition().common_gas_pressure() || model_.composition().n_scalars() > 0) { // they have no node
+    std::vector<PetscReal> scalars;
+    if (!reading_) PetscCall(model_.airway().scalars(X, scalars));
+    PetscCall(table(name + "/scalars", scalars, PetscReal(0), [](PetscReal &row, Cells &cells) { cells(row); }));
+    PetscCall(check(scalars.size() == 1 + model_.composition().n_scalars(), name + "/scalars"));
+    if (reading_) PetscCall(model_.airway().set_scalars(X, scalars));
   }
   PetscCall(DMRestoreLocalVector(dm, &x));
   PetscFunctionReturn(PETSC_SUCCESS);

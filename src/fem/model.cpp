@@ -11,13 +11,6 @@
 
 namespace pulmo {
 
-namespace {
-
-/// Nodes that hold one value by different sums differ by less than this share of it.
-constexpr PetscReal rounding = 1e-14;
-
-} // namespace
-
 Model::Model() = default;
 Model::~Model() = default;
 
@@ -274,7 +267,13 @@ PetscErrorCode Model::create_section()
   PetscCall(DMPlexCreateSection(dm_, labels.data(), components.data(), dofs.data(), (PetscInt)bc_field.size(),
                                 bc_field.data(), bc_components.data(), bc_points.data(), nullptr, section.out()));
   for (PetscInt f = 0; f < n_fields; ++f) PetscCall(PetscSectionSetFieldName(section, f, fields[f].name.c_str()));
-  if (composition().common_gas_pressure()) PetscCall(add_carrier(section));
+  if (composition().common_gas_pressure()) {
+    PulmoUserCheck(
+        own_, PetscObjectComm((PetscObject)(DM)dm_),
+        "-petscfe_type basic cannot carry the unknown gas pressure of a flow phase or a tube without -airflow; use the "
+        "default, pulmo");
+    PetscCall(airway_.add_rows(dm_, 1, components[displacement], section));
+  }
   PetscCall(add_symmetries(section));
   PetscCall(DMSetLocalSection(dm_, section));
 
@@ -300,7 +299,6 @@ PetscErrorCode Model::create_section()
     }
   }
   PetscCall(find_airway(constraint_of));
-  if (closes_rows_) PetscCall(find_carrier());
   PetscInt n_known;
   IS *rows;
   PetscCall(DMCreateFieldIS(dm_, &n_known, nullptr, &rows));
@@ -330,145 +328,31 @@ PetscErrorCode Model::add_symmetries(PetscSection section) const
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-/// The airway's nodes, with their share of its area: the integrals of their basis functions.
 PetscErrorCode Model::find_airway(const std::vector<PetscInt> &constraint_of)
 {
-  const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
-  PetscSection section, global;
-  PetscInt begin, end;
-  std::vector<PetscInt> facets;
+  std::vector<AirwayNodes::Group> groups;
+  std::set<std::string> surfaces; // open, and no scalar of an effect is their pressure
+  std::vector<bool> held_as_airway(constraint_of.size() / 5);
+  PetscInt scalar = 1; // after the pressure at the opening
 
   PetscFunctionBeginUser;
-  PetscCall(DMGetLocalSection(dm_, &section));
-  PetscCall(DMGetGlobalSection(dm_, &global)); // made here, used by DMPlexGetPointGlobalField
-  PetscCall(DMPlexGetChart(dm_, &begin, &end));
-  std::map<PetscInt, PetscReal> share;
-  std::set<std::string> surfaces;
   for (const Constraint &c : composition().constraints())
     if (c.at_airway) surfaces.insert(c.surface);
+  const std::vector<std::string> open(surfaces.begin(), surfaces.end());
   closes_rows_ = !surfaces.empty() || composition().common_gas_pressure();
-  for (const std::string &surface : surfaces) {
-    PetscCall(mesh_->facets(surface, facets));
-    for (PetscInt facet : facets) {
-      PetscInt *closure = nullptr, n_closure;
-      PetscReal area;
-      PetscCall(DMPlexComputeCellGeometryFVM(dm_, facet, &area, nullptr, nullptr));
-      PetscCall(DMPlexGetTransitiveClosure(dm_, facet, PETSC_TRUE, &n_closure, &closure));
-      // the face, its edges, its vertices: a third each for the vertices of P1, for the edges of P2
-      const PetscInt first = composition().elements().pressure == 1 ? 4 : 1;
-      for (PetscInt j = first; j < first + 3; ++j) share[closure[2 * j]] += area / 3;
-      PetscCall(DMPlexRestoreTransitiveClosure(dm_, facet, PETSC_TRUE, &n_closure, &closure));
+  for (const ScalarGroup &group : composition().scalar_groups())
+    for (const ScalarSpec &spec : group.scalars) {
+      if (!spec.surfaces.empty()) groups.push_back({spec.surfaces, scalar});
+      for (const SurfacePart &part : spec.surfaces) surfaces.erase(part.surface);
+      ++scalar;
     }
-  }
-  for (PetscInt p = begin; p < end && !surfaces.empty(); ++p) {
-    PetscInt dof, offset, row, row_end;
-    if (constraint_of[5 * p + 4] < 0 || constraint_of[5 * p + 3] >= 0) continue;
-    PetscCall(PetscSectionGetFieldDof(section, p, pressure, &dof));
-    if (dof == 0) continue;
-    PetscCall(PetscSectionGetFieldOffset(section, p, pressure, &offset));
-    PetscCall(DMPlexGetPointGlobalField(dm_, p, pressure, &row, &row_end));
-    airway_.push_back({p, offset, row < 0 ? -1 : row, share.count(p) ? share[p] : 0});
-  }
-  airway_area_ = 0;
-  for (const AirwayNode &node : airway_) {
-    airway_area_ += node.area;
-    if (node.row >= 0) closed_rows_.push_back(node.row);
-  }
-  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &airway_area_, 1, MPIU_REAL, MPI_SUM, comm));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-/// Rebuilds the section with a dof of its own for the uniform gas pressure, on the first cell of the first rank that
-/// has one. It belongs to no field, so element loops do not see it.
-PetscErrorCode Model::add_carrier(SectionHandle &section)
-{
-  const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
-  SectionHandle wider;
-  PetscInt begin, end, cell_begin, cell_end, n_fields;
-  PetscMPIInt rank;
-
-  PetscFunctionBeginUser;
-  PulmoUserCheck(
-      own_, comm,
-      "-petscfe_type basic cannot carry the unknown gas pressure of a flow phase or a tube without -airflow; use the "
-      "default, pulmo");
-  PetscCallMPI(MPI_Comm_rank(comm, &rank));
-  PetscCall(DMPlexGetHeightStratum(dm_, 0, &cell_begin, &cell_end));
-  PetscMPIInt first = cell_end > cell_begin ? rank : PETSC_MPI_INT_MAX;
-  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &first, 1, MPI_INT, MPI_MIN, comm));
-  carrier_rank_ = first;
-  const PetscInt carrier = rank == first ? cell_begin : -1;
-  // as many dofs as every other mesh point has, so that the matrix keeps its block size; one of them is used
-  const PetscInt dofs = composition().fields()[displacement].components;
-
-  PetscCall(PetscSectionGetChart(section, &begin, &end));
-  PetscCall(PetscSectionGetNumFields(section, &n_fields));
-  PetscCall(PetscSectionCreate(comm, wider.out()));
-  PetscCall(PetscSectionSetNumFields(wider, n_fields));
-  PetscCall(PetscSectionSetChart(wider, begin, end));
-  for (PetscInt f = 0; f < n_fields; ++f) {
-    PetscInt components;
-    const char *name;
-    PetscCall(PetscSectionGetFieldComponents(section, f, &components));
-    PetscCall(PetscSectionSetFieldComponents(wider, f, components));
-    PetscCall(PetscSectionGetFieldName(section, f, &name));
-    PetscCall(PetscSectionSetFieldName(wider, f, name));
-  }
-  PetscInt dof;
-  for (PetscInt p = begin; p < end; ++p) {
-    PetscCall(PetscSectionGetDof(section, p, &dof));
-    PetscCall(PetscSectionSetDof(wider, p, dof + (p == carrier ? dofs : 0)));
-    PetscCall(PetscSectionGetConstraintDof(section, p, &dof));
-    PetscCall(PetscSectionSetConstraintDof(wider, p, dof));
-    for (PetscInt f = 0; f < n_fields; ++f) {
-      PetscCall(PetscSectionGetFieldDof(section, p, f, &dof));
-      PetscCall(PetscSectionSetFieldDof(wider, p, f, dof));
-      PetscCall(PetscSectionGetFieldConstraintDof(section, p, f, &dof));
-      PetscCall(PetscSectionSetFieldConstraintDof(wider, p, f, dof));
-    }
-  }
-  PetscCall(PetscSectionSetUp(wider));
-  for (PetscInt p = begin; p < end; ++p) {
-    const PetscInt *which;
-    PetscCall(PetscSectionGetConstraintDof(section, p, &dof));
-    if (dof == 0) continue;
-    PetscCall(PetscSectionGetConstraintIndices(section, p, &which));
-    PetscCall(PetscSectionSetConstraintIndices(wider, p, which));
-    for (PetscInt f = 0; f < n_fields; ++f) {
-      PetscCall(PetscSectionGetFieldConstraintIndices(section, p, f, &which));
-      PetscCall(PetscSectionSetFieldConstraintIndices(wider, p, f, which));
-    }
-  }
-  section = std::move(wider);
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode Model::find_carrier()
-{
-  const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
-  PetscMPIInt rank;
-
-  PetscFunctionBeginUser;
-  PetscCallMPI(MPI_Comm_rank(comm, &rank));
-  if (composition().common_gas_pressure()) {
-    PetscSection global;
-    PetscInt cell, dof;
-    PetscCall(DMGetGlobalSection(dm_, &global));
-    PetscCall(DMPlexGetHeightStratum(dm_, 0, &cell, nullptr));
-    if (rank == carrier_rank_) {
-      PetscCall(PetscSectionGetDof(global, cell, &dof));
-      PetscCall(PetscSectionGetOffset(global, cell, &carrier_));
-      for (PetscInt d = 0; d < dof; ++d) {
-        closed_rows_.push_back(carrier_ + d);
-        if (d > 0) idle_rows_.push_back(carrier_ + d);
-      }
-    }
-  } else {
-    PetscMPIInt first = closed_rows_.empty() ? PETSC_MPI_INT_MAX : rank;
-    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &first, 1, MPI_INT, MPI_MIN, comm));
-    carrier_rank_ = first;
-    if (rank == first) carrier_ = closed_rows_.front();
-  }
+  AirwayNodes::Group rest; // at the pressure of the opening
+  for (const std::string &surface : surfaces) rest.surfaces.push_back({surface, ""});
+  if (!rest.surfaces.empty()) groups.push_back(rest);
+  for (std::size_t p = 0; p < held_as_airway.size(); ++p)
+    held_as_airway[p] = constraint_of[5 * p + 4] >= 0 && constraint_of[5 * p + 3] < 0;
+  PetscCall(
+      airway_.setup(dm_, *mesh_, composition().elements(), groups, open, held_as_airway, closes_rows_ ? scalar : 0));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -478,8 +362,9 @@ PetscErrorCode Model::set_step(const Stage &stage, PetscReal airway_pressure, Pe
 
   PetscFunctionBeginUser;
   const PetscReal load = step_.load;
-  step_ = Step(stage, airway_pressure, airway_area_ > 0 ? -airway_flow / airway_area_ : 0);
+  step_ = Step(stage, airway_pressure, airway_.area() > 0 ? -airway_flow / airway_.area() : 0);
   step_.load = load;
+  airway_.set_pressure(airway_pressure);
   row_scale_[displacement] = 1 / (modulus_ * L * L);
   if (row_scale_.size() > pressure) row_scale_[pressure] = (stage.slope > 0 ? 1 / stage.slope : stage.dt) / (L * L * L);
   PetscCall(pack_constants());
@@ -520,8 +405,7 @@ PetscErrorCode Model::constrain(PetscReal t, Vec local) const
     composition().constraints()[p.constraint].value(t, p.x, value);
     x[p.dof] = value[p.component];
   }
-  if (airway_held_)
-    for (const AirwayNode &node : airway_) x[node.dof] = step_.gas_pressure;
+  airway_.constrain(x);
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -531,25 +415,7 @@ PetscErrorCode Model::constrain_rate(Vec local, Vec before, PetscReal dt, Vec ra
   const ReadArray now(local), then(before);
   WriteArray r(rate);
   for (const Prescribed &p : prescribed_) r[p.dof] = (now[p.dof] - then[p.dof]) / dt;
-  if (airway_held_)
-    for (const AirwayNode &node : airway_) r[node.dof] = (now[node.dof] - then[node.dof]) / dt;
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode Model::close_rows(Vec X, Vec F) const
-{
-  PetscFunctionBeginUser;
-  if (airway_held_ && !closed_rows_.empty()) {
-    PetscInt first;
-    PetscCall(VecGetOwnershipRange(F, &first, nullptr));
-    const ReadArray x(X);
-    WriteArray f(F);
-    for (const PetscInt row : closed_rows_) {
-      const PetscScalar off = x[row - first] - step_.gas_pressure;
-      f[row - first] = std::abs(off) > rounding * std::abs(step_.gas_pressure) ? off : 0;
-    }
-    for (const PetscInt row : idle_rows_) f[row - first] = x[row - first];
-  }
+  airway_.constrain_rate(now, then, dt, r);
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -634,53 +500,6 @@ PetscErrorCode Model::loads(PetscReal t, Vec local, Vec F, PetscReal &force, Pet
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Model::carrier_value(Vec X, PetscReal &value) const
-{
-  PetscFunctionBeginUser;
-  value = 0;
-  if (carrier_ >= 0) {
-    PetscInt first;
-    PetscCall(VecGetOwnershipRange(X, &first, nullptr));
-    value = ReadArray(X)[carrier_ - first];
-  }
-  PetscCallMPI(MPI_Bcast(&value, 1, MPIU_REAL, carrier_rank_, PetscObjectComm((PetscObject)X)));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode Model::set_carrier_value(Vec X, PetscReal value) const
-{
-  PetscFunctionBeginUser;
-  if (carrier_ >= 0) PetscCall(VecSetValue(X, carrier_, value, INSERT_VALUES));
-  PetscCall(VecAssemblyBegin(X));
-  PetscCall(VecAssemblyEnd(X));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode Model::set_airway_nodes(Vec X, PetscReal value) const
-{
-  PetscInt first;
-
-  PetscFunctionBeginUser;
-  PetscCall(VecGetOwnershipRange(X, &first, nullptr));
-  {
-    WriteArray x(X);
-    for (const AirwayNode &node : airway_)
-      if (node.row >= 0) x[node.row - first] = value;
-  }
-  PetscCall(set_carrier_value(X, value));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode Model::airway_mean_pressure(Vec local, PetscReal &mean) const
-{
-  PetscFunctionBeginUser;
-  const ReadArray x(local);
-  mean = 0;
-  for (const AirwayNode &node : airway_) mean += node.area * x[node.dof] / airway_area_;
-  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &mean, 1, MPIU_REAL, MPI_SUM, PetscObjectComm((PetscObject)(DM)dm_)));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
 PetscErrorCode Model::residual(PetscReal t, Vec x, Vec x_t, Vec F)
 {
   PetscFunctionBeginUser;
@@ -727,13 +546,9 @@ PetscErrorCode Model::jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, Mat
   PetscCall(assembly_.jacobian(stock_loops() ? Assembly::Part::facets : Assembly::Part::all, t, x, x_t, shift,
                                row_scale_.data(), A, also_));
   if (also_) {
-    std::vector<PetscInt> closed;
-    if (airway_held_)
-      for (const AirwayNode &node : airway_) closed.push_back(node.point);
-    PetscCall(also_->end(closed));
+    PetscCall(also_->end(airway_.closed_points()));
   }
-  if (closes_rows_ && airway_held_)
-    PetscCall(MatZeroRowsColumns(A, (PetscInt)closed_rows_.size(), closed_rows_.data(), 1, nullptr, nullptr));
+  if (closes_rows_) PetscCall(airway_.close_rows(A, composition().n_scalars() > 0));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -751,21 +566,6 @@ PetscErrorCode Model::stock_jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shif
     PetscCall(VecISSet(scale_, rows, row_scale_[field]));
   }
   PetscCall(MatDiagonalScale(A, scale_, nullptr));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode Model::airway_flow(Vec F, PetscReal &flow) const
-{
-  const MPI_Comm comm = PetscObjectComm((PetscObject)(DM)dm_);
-  double sum = 0;
-
-  PetscFunctionBeginUser;
-  if (row_scale_.size() > pressure) {
-    const ReadArray f(F);
-    for (const AirwayNode &node : airway_) sum += f[node.dof] / row_scale_[pressure];
-  }
-  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &sum, 1, MPI_DOUBLE, MPI_SUM, comm));
-  flow = sum;
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -92,6 +92,7 @@ PetscErrorCode EnergyAudit::setup()
     part.terms.push_back(&term);
     part.account.push_back(account(term.account, term.kind));
   }
+  for (const ScalarEnergyTerm &term : model_.composition().scalar_energies()) (void)account(term.account, term.kind);
   PetscCall(DMCreateLocalVector(model_.dm(), before_.out()));
   PetscCall(DMGetLocalSection(model_.dm(), &section));
   PetscCall(PetscSectionGetChart(section, &begin, &end));
@@ -169,6 +170,28 @@ PetscErrorCode EnergyAudit::add_support_work(const StepReport &step, double &sum
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+void EnergyAudit::add_scalars(const StepReport &step, std::vector<double> &sums)
+{
+  const SignalRow &row = step.row, &last = step.rows[step.rows.size() - 2];
+  const auto state = [&](const ScalarGroup &group, const SignalRow &at) {
+    ScalarState s;
+    s.opening = at.pressure * units::kPa_per_cmH2O;
+    for (std::size_t i = group.offset; i < group.offset + group.scalars.size(); ++i) {
+      const auto value = [i](const SignalRow &r) {
+        return r.scalars.empty() ? 0 : r.scalars[i] * units::kPa_per_cmH2O;
+      };
+      s.value.push_back(value(at));
+      s.rate.push_back((value(row) - value(last)) / row.dt);
+      s.flow.push_back(at.scalar_flows.empty() ? 0 : at.scalar_flows[i] * units::mm3_per_ml);
+    }
+    return s;
+  };
+  for (const ScalarEnergyTerm &term : model_.composition().scalar_energies())
+    for (const ScalarGroup &group : model_.composition().scalar_groups())
+      if (group.effect == term.effect)
+        sums[account(term.account, term.kind)] += term.energy(state(group, row), state(group, last), row.dt);
+}
+
 PetscErrorCode EnergyAudit::observe(const StepReport &step)
 {
   const MPI_Comm comm = PetscObjectComm((PetscObject)model_.dm());
@@ -185,8 +208,10 @@ PetscErrorCode EnergyAudit::observe(const StepReport &step)
     PetscCall(add_support_work(step, sums[account("external", Energy::external)]));
     PetscCallMPI(
         MPI_Allreduce(MPI_IN_PLACE, sums.data(), static_cast<PetscMPIInt>(sums.size()), MPI_DOUBLE, MPI_SUM, comm));
+    if (!row.scalars.empty()) add_scalars(step, sums);
     for (double &sum : sums) sum *= units::j_per_kPa_mm3;
-    const double volume = row.flow * row.dt, work = row.machine_pressure() * volume * j_per_cmH2O_ml;
+    const double volume = (row.flow + row.stored_flow) * row.dt,
+                 work = row.machine_pressure() * volume * j_per_cmH2O_ml;
     sums[account("resistive_tube", Energy::dissipated)] +=
         (row.machine_pressure() - row.pressure) * volume * j_per_cmH2O_ml;
     balance.ventilator_work += work;

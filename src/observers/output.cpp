@@ -164,9 +164,15 @@ PetscErrorCode SignalWriter::observe(const StepReport &step)
       file_ = std::fopen(part.c_str(), "w");
       if (!file_) error = errno;
       if (file_)
-        std::fprintf(file_, "time_s,%s%svolume_ml,%sdt_s,newton_iterations,krylov_iterations,min_J,max_J%s\n",
+        std::fprintf(file_, "time_s,%s%svolume_ml,%sdt_s,newton_iterations,krylov_iterations,min_J,max_J%s",
                      ventilator ? "airway_pressure_cmH2O," : "", flow ? "flow_ml_per_s," : "",
                      ventilator ? "phase," : "", facts_.tube ? ",ventilator_pressure_cmH2O" : "");
+      for (const ScalarSpec &s : scalars_) {
+        if (!file_) break;
+        std::fprintf(file_, ",pressure_%s_cmH2O", s.name.c_str());
+        if (!s.surfaces.empty()) std::fprintf(file_, ",flow_%s_ml_per_s", s.name.c_str());
+      }
+      if (file_) std::fprintf(file_, "\n");
     }
     for (std::size_t i = first; file_ && i < step.rows.size(); ++i) {
       const SignalRow &r = step.rows[i];
@@ -177,6 +183,10 @@ PetscErrorCode SignalWriter::observe(const StepReport &step)
       if (ventilator) std::fprintf(file_, "%s,", r.phase.c_str());
       std::fprintf(file_, "%.15g,%ld,%ld,%.15g,%.15g", r.dt, r.newton, r.krylov, r.min_J, r.max_J);
       if (facts_.tube) std::fprintf(file_, ",%.15g", r.machine_pressure());
+      for (std::size_t k = 0; k < scalars_.size(); ++k) {
+        std::fprintf(file_, ",%.15g", r.scalars[k]);
+        if (!scalars_[k].surfaces.empty()) std::fprintf(file_, ",%.15g", r.scalar_flows[k]);
+      }
       std::fprintf(file_, "\n");
     }
     if (file_ && (std::fflush(file_) != 0 || std::ferror(file_))) error = errno > 0 ? errno : EIO;

@@ -241,6 +241,11 @@ PetscErrorCode print_ledger(MPI_Comm comm, const Scene &scene, const Model &mode
                  std::to_string(m.quantities.size() * model.memory()->bytes() /
                                 static_cast<std::size_t>(composition.memory_width())) +
                  " bytes on this rank)";
+    for (const ScalarGroup &group : composition.scalar_groups())
+      if (group.effect == name)
+        for (const ScalarSpec &s : group.scalars)
+          terms += "\n    unknown pressure " + s.name +
+                   (s.surfaces.empty() ? "" : " on " + s.surfaces.front().text() + " (one more solve a Newton step)");
     PetscCall(PetscPrintf(comm, "%-16s %-22s %9.4f %5.1f %%%s\n", name.c_str(),
                           own_fields.empty() ? "-" : own_fields.c_str(), spent[name],
                           seconds.total > 0 ? 100 * spent[name] / seconds.total : 0, terms.c_str()));

@@ -492,7 +492,7 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   PulmoUserCheck(!output.error_indicator() || (elements.displacement == 2 && elements.pressure == 1), comm,
                  "-output_fields_error_indicator recovers the stress of -elements P2-P1; leave one of the two out");
 
-  SignalWriter signals(comm, output, scene.facts());
+  SignalWriter signals(comm, output, scene.facts(), run.model().composition());
   ProgressPrinter progress(comm, scene.facts());
   FieldWriter fields(output, scene, run.model());
   Sampling sampling;

@@ -1,3 +1,4 @@
+// The condition at the airway opening.
 #include "pulmo/time/airway.hpp"
 
 #include "pulmo/mesh/mesh.hpp"
@@ -18,33 +19,43 @@ void Airway::begin_phase(const Phase &phase, PetscReal volume, PetscReal first_s
 {
   phase_ = phase;
   if (!phase_.from) phase_.from = ventilator_before_;
-  volume_begin_ = volume;
+  volume_begin_ = volume + scalars_.stored(before_);
   first_step_ = first_step;
-  limited_ = limited_before_ = retake_ = false;
+  limited_ = limited_before_ = exceeds_ = retake_ = false;
 }
 
-PetscErrorCode Airway::persist(Archive &archive)
+PetscErrorCode Airway::past(Past &past)
 {
   PetscReal from = phase_.from.value_or(0);
 
   PetscFunctionBeginUser;
-  PetscCall(archive.value("airway/phase_starts_from", from)); // kPa or mm^3/s
+  before_.resize(scalars_.size());
+  PetscCall(past.visit("phase_starts_from", from)); // kPa or mm^3/s
   phase_.from = from;
-  PetscCall(archive.value("airway/limited", limited_before_));
-  PetscCall(archive.value("airway/pressure_kPa", pressure_before_));
-  PetscCall(archive.value("airway/ventilator_pressure_kPa", ventilator_before_));
-  PetscCall(archive.value("airway/volume_at_phase_begin_mm3", volume_begin_));
-  PetscCall(archive.value("airway/first_step_s", first_step_));
+  PetscCall(past.visit("limited", limited_before_));
+  PetscCall(past.visit("pressure_kPa", before_.front()));
+  PetscCall(past.visit("ventilator_pressure_kPa", ventilator_before_));
+  PetscCall(past.visit("volume_at_phase_begin_mm3", volume_begin_));
+  PetscCall(past.visit("first_step_s", first_step_));
+  if (scalars_.of_effects()) PetscCall(past.visit("scalars_kPa", before_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Airway::restore(Vec X) const
+{
+  PetscFunctionBeginUser;
+  if (model_.composition().common_gas_pressure() || scalars_.of_effects())
+    PetscCall(model_.airway().set_scalars(X, before_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
 void Airway::set_mode()
 {
-  // the mean over a free surface is no pressure that can be held instead: a limit needs a common one
+  // the mean over a free surface is no pressure that can be held instead: a limit needs one that is solved for
   if (control() == Control::flow)
-    mode_ = facts_.free_airway() && !phase_.limit ? Mode::free : Mode::common;
+    mode_ = facts_.free_airway() && !phase_.limit ? Mode::free : Mode::solved;
   else
-    mode_ = facts_.tube ? Mode::common : Mode::held;
+    mode_ = facts_.tube || scalars_.of_effects() ? Mode::solved : Mode::held;
 }
 
 PetscReal Airway::prescribed_pressure(PetscReal t, PetscReal step_end) const
@@ -56,65 +67,88 @@ PetscReal Airway::prescribed_pressure(PetscReal t, PetscReal step_end) const
   return phase_.value(t);
 }
 
-void Airway::begin_stage(PetscReal t, PetscReal step_end)
+void Airway::begin(PetscReal t, PetscReal step_end)
 {
   limited_ = limited_before_ || retake_;
+  exceeds_ = false;
   retake_ = retake_ && scheme_.half_step(); // the whole step that follows belongs to the same attempt
   set_mode();
   if (control() == Control::flow)
     volume_target_ = volume_begin_ + phase_.delivered(t);
   else
     target_ = prescribed_pressure(t, step_end);
-  pressure_ = mode_ == Mode::held ? target_ : pressure_before_; // not what a failed attempt left
+  std::vector<PetscReal> values = before_; // not what a failed attempt left
+  if (mode_ == Mode::held) values.front() = target_;
+  pressure_ = values.front();
+  const std::vector<PetscReal> past = scheme_.past_rates();
+  past_flow_ = scheme_.past_flow() + scalars_.stored(past);
+  scalars_.begin(values, mode_ == Mode::solved, scheme_.slope(), past);
+}
+
+ScalarUnknowns::OpeningEquation Airway::equation() const
+{
+  const bool flow = control() == Control::flow;
+  return [this, flow](PetscReal P, PetscReal gas) {
+    const PetscReal h = model_.composition().mesh().length(), modulus = model_.modulus();
+    if (flow) return ScalarUnknowns::Opening{(gas - volume_target_) / (h * h * h), 0, 1 / (h * h * h)};
+    const PetscReal Q = gas_flow(gas), drop = facts_.tube ? facts_.tube->drop(Q) : 0,
+                    slope = facts_.tube ? facts_.tube->slope(Q) : 0;
+    return ScalarUnknowns::Opening{(P + drop - target_) / modulus, 1 / modulus, slope * scheme_.slope() / modulus};
+  };
 }
 
 PetscErrorCode Airway::guess(Vec X) const
 {
   PetscFunctionBeginUser;
-  if (mode_ != Mode::free) PetscCall(model_.set_airway_nodes(X, pressure_));
+  if (mode_ != Mode::free) PetscCall(model_.airway().set(X, scalars_.values()));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Airway::hold(Vec increment) const
+{
+  std::vector<PetscReal> change(scalars_.size(), 0);
+
+  PetscFunctionBeginUser;
+  if (mode_ == Mode::free) PetscFunctionReturn(PETSC_SUCCESS);
+  // one value for all nodes of a group: those of steps with a free airway differ from node to node
+  if (mode_ == Mode::solved) PetscCall(model_.airway().scalars(increment, change));
+  PetscCall(model_.airway().set(increment, change));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
 PetscErrorCode Airway::apply(Vec X)
 {
   PetscFunctionBeginUser;
-  if (mode_ == Mode::common && !frozen_) PetscCall(model_.carrier_value(X, pressure_));
-  model_.hold_airway(mode_ != Mode::free);
+  PetscCall(scalars_.take(X));
+  if (mode_ == Mode::solved) pressure_ = scalars_.opening();
+  model_.airway().hold(mode_ != Mode::free);
   PetscCall(model_.set_step(scheme_.stage(), pressure_, mode_ == Mode::free ? flow() : 0));
+  if (scalars_.of_effects()) model_.airway().set_pressures(scalars_.values());
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Airway::close(PetscReal volume, Vec X, Vec F)
+PetscErrorCode Airway::close(PetscReal volume, Vec local_F, Vec X, Vec F)
 {
   PetscFunctionBeginUser;
-  volume_ = volume;
-  PetscCall(model_.close_rows(X, F));
-  if (mode_ == Mode::common && !frozen_) {
-    const PetscReal h = model_.composition().mesh().length(), Q = scheme_.flow(volume);
-    const PetscReal c = control() == Control::flow ? (volume - volume_target_) / (h * h * h)
-                                                   : (ventilator_pressure(Q) - target_) / model_.modulus();
-    PetscCall(model_.set_carrier_value(F, c));
-  }
+  volume_ = volume + scalars_.stored(scalars_.values());
+  PetscCall(model_.airway().close_rows(X, F));
+  PetscCall(scalars_.close(equation(), volume, local_F, F));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscReal Airway::change(PetscReal c, PetscReal c_P, PetscReal volume_fixed, PetscReal volume_per_P) const
+PetscErrorCode Airway::unmet(PetscReal volume, Vec local_F, Unmet &unmet)
 {
-  const PetscReal h = model_.composition().mesh().length();
-  const PetscReal c_V = control() == Control::flow
-                            ? 1 / (h * h * h)
-                            : facts_.tube->slope(scheme_.flow(volume_)) * scheme_.slope() / model_.modulus();
-  return -(c + c_V * volume_fixed) / (c_P + c_V * volume_per_P);
-}
+  const PetscReal gas = volume + scalars_.stored(scalars_.values());
 
-Airway::Unmet Airway::unmet(PetscReal volume) const
-{
-  Unmet unmet;
+  PetscFunctionBeginUser;
+  PetscCall(scalars_.close(equation(), volume, local_F, nullptr));
+  unmet = Unmet();
   if (control() == Control::flow)
-    unmet.volume = std::abs(volume - volume_target_);
-  else if (mode_ == Mode::common)
-    unmet.pressure = std::abs(ventilator_pressure(scheme_.flow(volume)) - target_);
-  return unmet;
+    unmet.volume = std::abs(gas - volume_target_);
+  else if (mode_ == Mode::solved)
+    unmet.pressure = std::abs(ventilator_pressure(gas_flow(gas)) - target_);
+  unmet.pressure = std::max(unmet.pressure, scalars_.unmet());
+  PetscFunctionReturn(PETSC_SUCCESS);
 }
 
 bool Airway::satisfied() const
@@ -127,16 +161,24 @@ bool Airway::satisfied() const
 PetscErrorCode Airway::pressure(Vec local, PetscReal &pressure)
 {
   PetscFunctionBeginUser;
-  if (mode_ == Mode::free) PetscCall(model_.airway_mean_pressure(local, pressure_));
+  if (mode_ == Mode::free) PetscCall(model_.airway().mean_pressure(local, pressure_));
   pressure = pressure_;
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-bool Airway::limit(PetscReal flow)
+Verdict Airway::judge(const Attempt &attempt)
 {
-  if (limited_) return false;
-  retake_ = phase_.limit && ventilator_pressure(flow) > *phase_.limit;
-  return retake_;
+  exceeds_ = !limited_ && phase_.limit && ventilator_pressure(attempt.flow) > *phase_.limit;
+  if (exceeds_) return Verdict::again;
+  return limited_ && !limited_before_ ? Verdict::kink : Verdict::accept;
+}
+
+void Airway::accept(const Attempt &attempt)
+{
+  before_ = scalars_.values();
+  before_.front() = pressure_;
+  ventilator_before_ = ventilator_pressure(attempt.flow);
+  limited_before_ = limited_;
 }
 
 } // namespace pulmo

@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <numeric>
 #include <petsc/private/snesimpl.h>
 #include <petsc/private/tsimpl.h>
 
@@ -27,12 +28,6 @@ constexpr PetscReal least_step = 1e-5;
 /// that it cannot pass.
 constexpr PetscReal crawling_step = 1e-3;
 constexpr int crawling_steps = 20;
-
-/// A Krylov method solves for z (Simulation::border) to a share of its right-hand side, which grows with the
-/// permeability; it is solved on, so many times at most, until what is left of it adds less than this share to the
-/// residual.
-constexpr int max_border_solves = 8;
-constexpr PetscReal border_share = 0.1;
 
 /// No load leaves a residual as small as this, but rounding does.
 constexpr PetscReal rounding = 1e-13;
@@ -87,6 +82,12 @@ PetscErrorCode Simulation::setup()
   PetscCall(predictor_.setup(state_));
   balance_.setup(scene_.mesh().volume(), model_.modulus());
   PetscCall(create_solver());
+  partners_ = {&airway_};
+  for (const Effect *effect : scene_.active())
+    for (auto &partner : effect->partners(scene_.facts())) {
+      partners_.push_back(partner.get());
+      effect_partners_.push_back(std::move(partner));
+    }
   phases_ = phases();
   end_ = phases_.back().end;
   whole_end_ = scene_.facts().ventilator ? scene_.facts().ventilator->phases()[phases_.size() - 1].end : PETSC_MAX_REAL;
@@ -200,7 +201,10 @@ PetscErrorCode Simulation::start()
   if (phases_.front().control == Control::pressure) // a run begins with all at rest, or with a pressure of its own
     accepted_.pressure = phases_.front().from.value_or(0) / units::kPa_per_cmH2O;
   accepted_.ventilator_pressure = accepted_.pressure;
-  PetscCall(scheme_.begin(model_, 0, measures.volume_change, before_));
+  airway_.start();
+  accepted_.scalars.assign(model_.composition().n_scalars(), 0);
+  accepted_.scalar_flows = accepted_.scalars;
+  PetscCall(scheme_.begin(model_, moment(0, measures.volume_change, before_)));
   PetscCall(warn_of_low_limits());
   dt_ = asked_dt();
   PetscCall(report(accepted_, measures));
@@ -312,8 +316,8 @@ PetscErrorCode Simulation::before_stage(PetscReal t)
     model_.memory()->settle();
     model_.memory()->look_back(scheme_.looks_back_at());
   }
-  airway_.freeze(false);
-  airway_.begin_stage(t, begin + dt);
+  airway_.scalars().freeze(false);
+  for (Partner *partner : partners_) partner->begin(t, begin + dt);
   model_.set_load(std::min<PetscReal>(1, (begin + dt) / std::min(phases_.front().dt.value_or(wanted_dt_), end_)));
   extra_newton_ = 0;
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -379,60 +383,19 @@ PetscErrorCode Simulation::residual(PetscReal t, Vec X, Vec Xdot, Vec F)
   PetscCall(local_residual(t));
   PetscCall(VecZeroEntries(F));
   PetscCall(DMLocalToGlobal(model_.dm(), local_residual_, ADD_VALUES, F));
-  PetscCall(airway_.close(measures.volume_change, X, F));
+  PetscCall(airway_.close(measures.volume_change, local_residual_, X, F));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-/// With J y = F known, solves J z = dF/dP and steps to the P for which the linearised scalar equation holds.
 PetscErrorCode Simulation::border(SNES snes, Vec X, Vec Y)
 {
-  constexpr PetscReal share = 1e-4; // every term so far is linear in P: the difference quotient is then exact
   Vec F;
-  KSP ksp;
-  KSPConvergedReason reason;
-  PetscInt iterations;
-  PetscReal P, along_y, along_z, here, there, change, norm, left;
 
   PetscFunctionBeginUser;
-  if (airway_.mode() != Airway::Mode::common) PetscFunctionReturn(PETSC_SUCCESS);
+  if (airway_.mode() != Airway::Mode::solved) PetscFunctionReturn(PETSC_SUCCESS);
   PetscCall(airway_.apply(X));
-  PetscCall(airway_.pressure(local_, P));
-  const PetscReal dP = share * std::max(model_.modulus(), std::abs(P));
+  PetscCall(airway_.complete(snes, matrix_, X, Y, local_, krylov_));
   PetscCall(SNESGetFunction(snes, &F, nullptr, nullptr));
-  if (airway_.frozen()) { // PETSc's test of the Jacobian left its residual
-    airway_.freeze(false);
-    PetscCall(SNESComputeFunction(snes, X, F));
-  }
-  PetscCall(VecCopy(X, border_x_));
-  PetscCall(model_.set_airway_nodes(border_x_, P + dP));
-  PetscCall(SNESComputeFunction(snes, border_x_, border_b_));
-  PetscCall(model_.carrier_value(F, here));
-  PetscCall(model_.carrier_value(border_b_, there));
-  PetscCall(VecAXPBY(border_b_, -1 / dP, 1 / dP, F));
-  PetscCall(model_.set_airway_nodes(border_b_, 0));
-  PetscCall(SNESGetKSP(snes, &ksp));
-  PetscCall(VecNorm(F, NORM_2, &norm));
-  PetscCall(VecZeroEntries(border_y_)); // constrained values do not change
-  PetscCall(DMGlobalToLocal(model_.dm(), Y, INSERT_VALUES, border_y_));
-  PetscCall(model_.volume_derivative(local_, border_y_, along_y));
-  PetscCall(VecZeroEntries(border_z_));
-  for (int i = 0; i == 0 || (i < max_border_solves && std::abs(change) * left > border_share * norm); ++i) {
-    PetscCall(VecZeroEntries(border_x_)); // with -ksp_initial_guess_nonzero it is one
-    PetscCall(KSPSolve(ksp, border_b_, border_x_));
-    PetscCall(KSPGetConvergedReason(ksp, &reason));
-    PetscCall(KSPGetIterationNumber(ksp, &iterations));
-    krylov_ += iterations;
-    PetscCall(VecAXPY(border_z_, 1, border_x_));
-    PetscCall(MatMult(matrix_, border_x_, border_r_));
-    PetscCall(VecAXPY(border_b_, -1, border_r_));
-    PetscCall(VecNorm(border_b_, NORM_2, &left));
-    PetscCall(DMGlobalToLocal(model_.dm(), border_z_, INSERT_VALUES, border_y_));
-    PetscCall(model_.volume_derivative(local_, border_y_, along_z));
-    change = airway_.change(here, (there - here) / dP, -along_y, -along_z);
-    if (reason < 0) break; // the step will be cut
-  }
-  PetscCall(VecAXPY(Y, change, border_z_));
-  PetscCall(model_.set_airway_nodes(Y, -change)); // the new state is X - Y
   bordered_ = {Y, F};
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -453,16 +416,7 @@ PetscErrorCode Simulation::guess(SNES snes, Vec X)
   if (scheme_.multistep()) PetscCall(VecCopy(state_, X)); // PETSc extrapolates: tolerances would tighten as dt falls
   PetscCall(airway_.guess(X));
   if (!predictor_.in_use()) PetscFunctionReturn(PETSC_SUCCESS);
-  const auto hold = [this](Vec increment) -> PetscErrorCode {
-    PetscReal common = 0;
-
-    PetscFunctionBeginUser;
-    if (airway_.mode() == Airway::Mode::free) PetscFunctionReturn(PETSC_SUCCESS);
-    // one value for all nodes: those of steps with a free airway differ from node to node
-    if (airway_.mode() == Airway::Mode::common) PetscCall(model_.carrier_value(increment, common));
-    PetscCall(model_.set_airway_nodes(increment, common));
-    PetscFunctionReturn(PETSC_SUCCESS);
-  };
+  const auto hold = [this](Vec increment) { return airway_.hold(increment); };
   PetscCall(predictor_.improve(snes, hold, X, start_norm_));
   inverted_ = false; // a guess was tried, no more
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -489,7 +443,7 @@ PetscErrorCode Simulation::jacobian(PetscReal t, Vec X, Vec Xdot, Mat A)
   PetscFunctionBeginUser;
   PetscCall(scatter(t, X, Xdot));
   PetscCall(model_.jacobian(t, local_, rate_, scheme_.slope(), A));
-  airway_.freeze(tests_jacobian_); // PETSc's test follows, then border()
+  airway_.scalars().freeze(tests_jacobian_); // PETSc's test follows, then border()
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -555,28 +509,47 @@ PetscErrorCode Simulation::accept_stage(PetscReal t, Vec X, PetscBool *accept)
   PetscCall(model_.measure(local_, measures));
   *accept = PetscBool(measures.min_J > 0);
   if (!*accept) PetscCall(fail(dt, "converged to a state with J <= 0", 0, measures, true, true));
-  if (*accept) {
-    PetscReal pressure;
-    PetscCall(airway_.pressure(local_, pressure));
-    if (airway_.limit(scheme_.flow(measures.volume_change))) { // the step is taken again, as long as it was: a shorter
-                                                               // one would let the flow overshoot
-      PetscCall(keep_step(dt));
-      *accept = PETSC_FALSE;
-    } else {
-      bool solved;
-      candidate_ = {t, measures.volume_change / units::mm3_per_ml, pressure / units::kPa_per_cmH2O};
-      PetscCall(judge(t, measures.volume_change, pressure, solved));
-      *accept = PetscBool(solved);
-      if (solved) {
-        if (model_.memory() && scheme_.half_step()) {
-          PetscCall(model_.memory()->compute(t, local_, rate_));
-          model_.memory()->keep_middle();
-        }
-        PetscCall(scheme_.accept_stage(model_, t, measures.volume_change, local_));
-      } else
-        PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED)); // a shorter step would be solved no better
-    }
+  if (!*accept) PetscFunctionReturn(PETSC_SUCCESS);
+  Attempt attempt{t, dt, measures.volume_change, 0, 0, local_};
+  PetscCall(airway_.pressure(local_, attempt.pressure));
+  attempt.flow = airway_.opening_flow(scheme_.flow(measures.volume_change));
+  PetscCall(ask_partners(attempt, accept));
+  if (!*accept) PetscFunctionReturn(PETSC_SUCCESS);
+  bool solved;
+  candidate_ = {t, measures.volume_change / units::mm3_per_ml, attempt.pressure / units::kPa_per_cmH2O};
+  PetscCall(judge(t, measures.volume_change, attempt.pressure, solved));
+  *accept = PetscBool(solved);
+  if (!solved) {
+    PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED)); // a shorter step would be solved no better
+    PetscFunctionReturn(PETSC_SUCCESS);
   }
+  if (model_.memory() && scheme_.half_step()) {
+    PetscCall(model_.memory()->compute(t, local_, rate_));
+    model_.memory()->keep_middle();
+  }
+  PetscCall(scheme_.accept_stage(model_, moment(t, measures.volume_change, local_)));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Asks the partners of @p attempt; where one of them does not accept it the step is taken again, or a shorter one.
+PetscErrorCode Simulation::ask_partners(const Attempt &attempt, PetscBool *accept)
+{
+  Verdict verdict = Verdict::accept;
+  std::string why;
+
+  PetscFunctionBeginUser;
+  for (Partner *partner : partners_) {
+    const Verdict own = partner->judge(attempt);
+    if (own > verdict) why = partner->why();
+    verdict = std::max(verdict, own);
+  }
+  *accept = PetscBool(verdict <= Verdict::kink);
+  kink_ = verdict == Verdict::kink;
+  if (verdict == Verdict::again) {
+    for (Partner *partner : partners_) partner->reject(verdict);
+    PetscCall(keep_step(attempt.dt));
+  }
+  if (verdict == Verdict::shorter) PetscCall(reject(attempt.dt, why, 0, Measures(), false));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -593,10 +566,11 @@ PetscErrorCode Simulation::judge(PetscReal t, PetscReal volume, PetscReal pressu
   PetscCall(DMGetGlobalVector(model_.dm(), &F));
   PetscCall(VecZeroEntries(F));
   PetscCall(DMLocalToGlobal(model_.dm(), local_residual_, ADD_VALUES, F));
-  if (airway_.mode() != Airway::Mode::free) PetscCall(model_.set_airway_nodes(F, 0)); // the flux that enters there
+  if (airway_.mode() != Airway::Mode::free) PetscCall(model_.airway().set(F, 0)); // the flux that enters there
   PetscCall(model_.residual_sums(F, sums));
   PetscCall(DMRestoreGlobalVector(model_.dm(), &F));
-  const Airway::Unmet unmet = airway_.unmet(volume);
+  Airway::Unmet unmet;
+  PetscCall(airway_.unmet(volume, local_residual_, unmet));
   const bool gas_flows = sums.absolute.size() > pulmo::pressure;
   errors.force = sums.absolute[displacement];
   errors.gas = std::max(unmet.volume, gas_flows ? sums.absolute[pulmo::pressure] / scheme_.slope() : 0);
@@ -649,8 +623,11 @@ PetscErrorCode Simulation::consistent_flow(PetscReal &flow) const
   PetscFunctionBeginUser;
   if (airway_.mode() == Airway::Mode::free)
     flow = airway_.flow();
-  else
-    PetscCall(model_.airway_flow(local_residual_, flow));
+  else {
+    std::vector<PetscReal> flows;
+    PetscCall(model_.airway().flows(local_residual_, model_.row_scale(pulmo::pressure), flows));
+    flow = std::accumulate(flows.begin(), flows.end(), PetscReal(0));
+  }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -679,7 +656,7 @@ PetscErrorCode Simulation::fail(PetscReal dt, const std::string &reason, PetscIn
   PetscCall(TSGetSNES(ts_, &snes));
   if (retry) PetscCall(lagging_.retry(snes, again));
   if (again) {
-    airway_.again();
+    for (Partner *partner : partners_) partner->reject(Verdict::again);
     PetscCall(keep_step(dt));
   } else {
     PetscCall(reject(dt, reason, newton, measures, inverted));
@@ -697,7 +674,7 @@ PetscErrorCode Simulation::reject(PetscReal dt, const std::string &reason, Petsc
   failures_.push_back({accepted_.time, dt, reason, newton, measures, inverted});
   cut_ = true;
   ++rejected_;
-  airway_.cut();
+  for (Partner *partner : partners_) partner->reject(Verdict::shorter);
   PetscCall(TSRestartStep(ts_)); // BDF and -ts_theta_initial_guess_extrapolate must not look at a failed state
   PetscCall(TSGetAdapt(ts_, &adapt));
   const PetscReal next = dt * adapt->scale_solve_failed;
@@ -748,11 +725,14 @@ PetscErrorCode Simulation::after_step()
   row.flow = flow / units::mm3_per_ml;
   PetscCall(VecCopy(local_, before_));
   const bool phase_goes_on = !same(t, phase_ == &phases_.back() ? whole_end_ : phase_->end); // perhaps after a restart
-  const bool kink = (same(t, phase_->begin + phase_->ramp) || airway_.reaches_limit()) && phase_goes_on;
-  airway_.accept(row.flow * units::mm3_per_ml);
+  const bool kink = (same(t, phase_->begin + phase_->ramp) || kink_) && phase_goes_on;
+  const PetscReal opening_flow = airway_.opening_flow(row.flow * units::mm3_per_ml);
+  const Attempt accepted{t, row.dt, measures.volume_change, pressure, opening_flow, local_};
+  for (Partner *partner : partners_) partner->accept(accepted);
   row.time = t;
   row.pressure = pressure / units::kPa_per_cmH2O;
-  row.ventilator_pressure = airway_.ventilator_pressure(row.flow * units::mm3_per_ml) / units::kPa_per_cmH2O;
+  row.ventilator_pressure = airway_.ventilator_pressure(opening_flow) / units::kPa_per_cmH2O;
+  list_scalars(row);
   row.phase = phase_->name;
   row.hold = airway_.holds_volume();
   row.breath = static_cast<int>(phase_->breath);
@@ -767,7 +747,7 @@ PetscErrorCode Simulation::after_step()
     PetscCall(model_.memory()->compute(t, local_, rate_));
     model_.memory()->accept();
   }
-  PetscCall(scheme_.accept(model_, t, measures.volume_change, local_));
+  PetscCall(scheme_.accept(model_, moment(t, measures.volume_change, local_)));
   step_control_.accept({t, row.volume, row.pressure});
   balance_.accept();
   accepted_ = row;
@@ -781,6 +761,17 @@ PetscErrorCode Simulation::after_step()
   if (crawled_ == crawling_steps) PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
   if (!same(t, end_)) PetscCall(heed_signal(TS_CONVERGED_USER));
   PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Writes the scalars of effects into a row of the signals.
+void Simulation::list_scalars(SignalRow &row) const
+{
+  const ScalarUnknowns &scalars = airway_.scalars();
+  row.stored_flow = (airway_.opening_flow(0)) / units::mm3_per_ml;
+  for (std::size_t i = 1; i < scalars.size(); ++i) {
+    row.scalars.push_back(scalars.values()[i] / units::kPa_per_cmH2O);
+    row.scalar_flows.push_back(scalars.flows()[i] / units::mm3_per_ml);
+  }
 }
 
 PetscErrorCode Simulation::heed_signal(TSConvergedReason reason)

@@ -41,7 +41,36 @@ private:
   std::size_t last_ = 0;
 };
 
+/// The past of a partner, under its name in an archive.
+class ArchivedPast final : public Past {
+public:
+  ArchivedPast(Archive &archive, const char *name) : archive_(archive), path_(std::string(name) + "/") {}
+  PetscErrorCode visit(const std::string &name, PetscReal &value) override
+  {
+    return archive_.value(path_ + name, value);
+  }
+  PetscErrorCode visit(const std::string &name, bool &value) override { return archive_.value(path_ + name, value); }
+  PetscErrorCode visit(const std::string &name, std::vector<PetscReal> &values) override
+  {
+    return archive_.table(path_ + name, values, PetscReal(0), [](PetscReal &row, Cells &cells) { cells(row); });
+  }
+
+private:
+  Archive &archive_;
+  std::string path_;
+};
+
 } // namespace
+
+PetscErrorCode Simulation::past_of_partners(Archive &archive)
+{
+  PetscFunctionBeginUser;
+  for (Partner *partner : partners_) {
+    ArchivedPast past(archive, partner->name());
+    PetscCall(partner->past(past));
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
 
 PetscErrorCode Simulation::persist_rows(Archive &archive)
 {
@@ -53,10 +82,16 @@ PetscErrorCode Simulation::persist_rows(Archive &archive)
   std::string names = phases.text();
   PetscCall(archive.text("signal_phases", names));
   if (archive.reading()) phases.read(names);
-  PetscCall(archive.table("signals", rows_, SignalRow(), [&](SignalRow &row, Cells &cells) {
+  SignalRow empty;
+  empty.scalars.assign(model_.composition().n_scalars(), 0);
+  empty.scalar_flows = empty.scalars;
+  PetscCall(archive.table("signals", rows_, empty, [&](SignalRow &row, Cells &cells) {
     std::size_t phase = archive.reading() ? 0 : phases.number(row.phase);
     cells(row.time, row.pressure, row.flow, row.volume, phase, row.breath, row.dt, row.newton, row.krylov, row.min_J,
           row.max_J, row.hold, row.ventilator_pressure);
+    for (double &pressure : row.scalars) cells(pressure);
+    for (double &flow : row.scalar_flows) cells(flow);
+    if (!row.scalars.empty()) cells(row.stored_flow);
     const std::string *name = phases.name(phase);
     known = known && name;
     if (archive.reading() && name) row.phase = *name;
@@ -85,7 +120,7 @@ PetscErrorCode Simulation::persist(Archive &archive)
   PetscCall(archive.value("min_J", min_J_));
   PetscCall(balance_.persist(archive));
   if (archive.reading()) PetscCall(resume(archive, index, wanted_dt, phase_end));
-  PetscCall(airway_.persist(archive));
+  PetscCall(past_of_partners(archive));
   PetscCall(archive.local("state", before_));
   if (archive.reading()) {
     PetscCall(VecZeroEntries(state_));
@@ -93,7 +128,7 @@ PetscErrorCode Simulation::persist(Archive &archive)
     PetscCall(airway_.restore(state_));
     PetscCall(check_state());
   }
-  PetscCall(scheme_.persist(archive, model_, accepted_.time, accepted_.volume * units::mm3_per_ml, before_));
+  PetscCall(scheme_.persist(archive, model_, moment(accepted_.time, accepted_.volume * units::mm3_per_ml, before_)));
   if (model_.memory()) PetscCall(model_.memory()->persist(archive, scheme_.multistep()));
   PetscCall(step_control_.persist(archive));
   PetscCall(predictor_.persist(archive, state_));
@@ -115,8 +150,8 @@ PetscErrorCode Simulation::check_state()
   // another pressure may be prescribed at the rim of the airway, and is not the airway's
   const bool other = std::any_of(constraints.begin(), constraints.end(),
                                  [](const Constraint &c) { return c.field == pulmo::pressure && !c.at_airway; });
-  if (scene_.facts().airflow && scene_.facts().ventilator && !other)
-    PetscCall(model_.airway_mean_pressure(before_, pressure));
+  if (scene_.facts().airflow && scene_.facts().ventilator && !other && !airway_.scalars().of_effects())
+    PetscCall(model_.airway().mean_pressure(before_, pressure));
   const PetscReal volume = measures.volume_change / units::mm3_per_ml, P = pressure / units::kPa_per_cmH2O,
                   lung = scene_.mesh().volume() / units::mm3_per_ml, modulus = model_.modulus() / units::kPa_per_cmH2O;
   PulmoUserCheck(std::abs(volume - accepted_.volume) <= same * (lung + std::abs(accepted_.volume)), options_.comm(),

@@ -198,12 +198,13 @@ PetscErrorCode Simulation::create_solver()
   if (lagging_.in_use() || predictor_.in_use() ||
       (scene_.facts().ventilator && scene_.facts().ventilator->prescribes_flow()))
     PetscCall(SNESSetConvergenceTest(snes, newton_converged, this, nullptr));
-  if (scene_.facts().common_pressure()) {
+  if (scene_.facts().unknown_opening_pressure()) {
     SNESLineSearch search;
     PetscBool newton;
     SNESType type;
     const SceneFacts &facts = scene_.facts();
-    const bool limits = facts.ventilator->limits_pressure(), split = facts.airflow && !facts.tube && !limits;
+    const bool limits = facts.ventilator->limits_pressure(),
+               split = facts.airflow && !facts.tube && !limits && !facts.airway_tree;
     PetscCall(PetscObjectTypeCompare((PetscObject)snes, SNESNEWTONLS, &newton));
     PetscCall(SNESGetType(snes, &type));
     PulmoUserCheck(
@@ -211,10 +212,11 @@ PetscErrorCode Simulation::create_solver()
         "option -snes_type %s does not go with %s: there the airway pressure is an unknown of its own, which "
         "needs Newton with line search; use -snes_type newtonls%s",
         type,
-        facts.tube ? "-tube"
-        : limits   ? "a limit of pressure"
-        : split    ? "-ventilator_flow_split common_pressure"
-                   : "a flow into a lung with -airflow off",
+        facts.airway_tree ? "-airway_tree"
+        : facts.tube      ? "-tube"
+        : limits          ? "a limit of pressure"
+        : split           ? "-ventilator_flow_split common_pressure"
+                          : "a flow into a lung with -airflow off",
         split ? ", or -ventilator_flow_split uniform" : "");
     for (const char *option : {"-snes_mf", "-snes_mf_operator", "-snes_fd", "-snes_fd_color"}) {
       PetscBool given = PETSC_FALSE;
@@ -233,11 +235,6 @@ PetscErrorCode Simulation::create_solver()
     PetscCall(PetscContainerDestroy(&self));
     PetscCall(MatGetOperation(matrix_, MATOP_MULT, &multiply_));
     PetscCall(MatSetOperation(matrix_, MATOP_MULT, (void (*)())matrix_product));
-    PetscCall(VecDuplicate(state_, border_x_.out()));
-    PetscCall(VecDuplicate(state_, border_b_.out()));
-    PetscCall(VecDuplicate(state_, border_z_.out()));
-    PetscCall(VecDuplicate(state_, border_r_.out()));
-    PetscCall(VecDuplicate(local_, border_y_.out()));
   }
   PetscCall(TSGetTimeStep(ts_, &wanted_dt_));
   PetscBool limits_steps;

@@ -34,21 +34,22 @@ PetscErrorCode TimeScheme::setup(TS ts, Vec like)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode TimeScheme::keep(Model &model, PetscReal t, PetscReal volume, Vec local, Past &past)
+PetscErrorCode TimeScheme::keep(Model &model, const Moment &now, Past &past)
 {
   PetscSection section;
   PetscInt begin, end;
 
   PetscFunctionBeginUser;
-  past.time = t;
-  past.volume = volume;
-  if (multistep_) PetscCall(VecCopy(local, past.state));
+  past.time = now.time;
+  past.volume = now.volume;
+  past.scalars = now.scalars;
+  if (multistep_) PetscCall(VecCopy(now.local, past.state));
   if (!gas_) PetscFunctionReturn(PETSC_SUCCESS);
   // with a slope of 1/s the kernels integrate J - 1, and what does not depend on it
   PetscCall(model.set_step({1, 0, true}, 0));
-  PetscCall(model.residual(t, local, zero_, rest_));
+  PetscCall(model.residual(now.time, now.local, zero_, rest_));
   PetscCall(model.set_step({1, 1, true}, 0));
-  PetscCall(model.residual(t, local, zero_, past.gas));
+  PetscCall(model.residual(now.time, now.local, zero_, past.gas));
   PetscCall(VecAXPY(past.gas, -1, rest_));
   PetscCall(VecScale(past.gas, 1 / model.row_scale(pressure)));
   PetscCall(DMGetLocalSection(model.dm(), &section));
@@ -63,18 +64,18 @@ PetscErrorCode TimeScheme::keep(Model &model, PetscReal t, PetscReal volume, Vec
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode TimeScheme::begin(Model &model, PetscReal t, PetscReal volume, Vec local)
+PetscErrorCode TimeScheme::begin(Model &model, const Moment &start)
 {
   PetscFunctionBeginUser;
-  PetscCall(keep(model, t, volume, local, last_));
+  PetscCall(keep(model, start, last_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode TimeScheme::persist(Archive &archive, Model &model, PetscReal t, PetscReal volume, Vec local)
+PetscErrorCode TimeScheme::persist(Archive &archive, Model &model, const Moment &last)
 {
   bool looks_back = multistep_ && !ts_->steprestart;
   int there = order();
-  PetscReal earlier_t = earlier_.time, earlier_volume = earlier_.volume;
+  Moment earlier{earlier_.time, earlier_.volume, nullptr, earlier_.scalars};
 
   PetscFunctionBeginUser;
   PetscCall(archive.value("time_scheme/order", there));
@@ -83,15 +84,19 @@ PetscErrorCode TimeScheme::persist(Archive &archive, Model &model, PetscReal t, 
   PetscCall(archive.value("time_scheme/looks_back", looks_back));
   if (looks_back) {
     VecHandle state;
-    PetscCall(archive.value("time_scheme/time_s", earlier_t));
-    PetscCall(archive.value("time_scheme/volume_mm3", earlier_volume));
-    PetscCall(VecDuplicate(local, state.out()));
+    PetscCall(archive.value("time_scheme/time_s", earlier.time));
+    PetscCall(archive.value("time_scheme/volume_mm3", earlier.volume));
+    if (model.composition().n_scalars() > 0)
+      PetscCall(archive.table("time_scheme/scalars_kPa", earlier.scalars, 0.0,
+                              [](PetscReal &row, Cells &cells) { cells(row); }));
+    PetscCall(VecDuplicate(last.local, state.out()));
     if (!archive.reading()) PetscCall(VecCopy(earlier_.state, state));
     PetscCall(archive.local("time_scheme/state", state));
     resumes_ = archive.reading();
-    if (resumes_) PetscCall(keep(model, earlier_t, earlier_volume, state, earlier_));
+    earlier.local = state;
+    if (resumes_) PetscCall(keep(model, earlier, earlier_));
   }
-  if (archive.reading()) PetscCall(keep(model, t, volume, local, last_));
+  if (archive.reading()) PetscCall(keep(model, last, last_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -130,18 +135,18 @@ PetscErrorCode TimeScheme::begin_stage(PetscReal t, PetscReal dt)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode TimeScheme::accept_stage(Model &model, PetscReal t, PetscReal volume, Vec local)
+PetscErrorCode TimeScheme::accept_stage(Model &model, const Moment &now)
 {
   PetscFunctionBeginUser;
-  if (half_) PetscCall(keep(model, t, volume, local, middle_));
+  if (half_) PetscCall(keep(model, now, middle_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode TimeScheme::accept(Model &model, PetscReal t, PetscReal volume, Vec local)
+PetscErrorCode TimeScheme::accept(Model &model, const Moment &now)
 {
   PetscFunctionBeginUser;
   std::swap(last_, earlier_);
-  PetscCall(keep(model, t, volume, local, last_));
+  PetscCall(keep(model, now, last_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -159,6 +164,14 @@ PetscReal TimeScheme::past_flow() const
   PetscReal sum = 0;
   for (std::size_t i = 0; i < used_.size(); ++i)
     if (used_[i]) sum += weight_[i] * used_[i]->volume;
+  return sum;
+}
+
+std::vector<PetscReal> TimeScheme::past_rates() const
+{
+  std::vector<PetscReal> sum(last_.scalars.size(), 0);
+  for (std::size_t i = 0; i < used_.size(); ++i)
+    for (std::size_t k = 0; used_[i] && k < sum.size(); ++k) sum[k] += weight_[i] * used_[i]->scalars[k];
   return sum;
 }
 

@@ -74,7 +74,7 @@ TEST(Harness, JacobiansAreThoseOfTheResiduals)
     VecHandle d, product, forward, backward;
     PULMO_OK(prepare(run, scene.options));
     PULMO_OK(random_state(run, ++seed, s));
-    run.model().hold_airway(false);
+    run.model().airway().hold(false);
     PULMO_OK(run.model().create_matrix(A.out()));
     PULMO_OK(DMCreateGlobalVector(run.model().dm(), d.out()));
     for (VecHandle *v : {&product, &forward, &backward}) PULMO_OK(VecDuplicate(d, v->out()));
@@ -115,7 +115,7 @@ void assemble(const std::string &options, std::vector<double> &residual, std::ve
   PULMO_OK(prepare(run, options));
   const auto &all = run.model().composition().terms();
   if (terms) *terms = std::count_if(all.begin(), all.end(), [&](const Term &t) { return t.effect == of; });
-  run.model().hold_airway(false);
+  run.model().airway().hold(false);
   PULMO_OK(random_state(run, 77, s));
   PULMO_OK(DMCreateGlobalVector(run.model().dm(), F.out()));
   PULMO_OK(residual_at(run, s, nullptr, 0, 1 / s.dt, F));

@@ -268,7 +268,7 @@ void expect_equivalent(const std::string &permeability, double low, double high)
   IS *splits;
   PULMO_OK(
       prepare(run, cube("cube.msh") + springs + "-airflow -airflow_surfaces x1 -airflow_permeability " + permeability));
-  run.model().hold_airway(false);
+  run.model().airway().hold(false);
   FixedStress schur;
   PULMO_OK(schur.setup(run.model().dm(), run.model().assembly()));
   run.model().also_fill(schur);

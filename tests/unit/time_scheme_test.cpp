@@ -20,7 +20,7 @@ TEST(TimeScheme, BackwardEulerIsExactForLines)
   SceneRun run(registry);
   PULMO_OK(prepare(run, SceneSpec().options()));
   TimeScheme scheme;
-  PULMO_OK(scheme.begin(run.model(), 1, 7, nullptr));
+  PULMO_OK(scheme.begin(run.model(), {1, 7, nullptr}));
   PULMO_OK(scheme.begin_stage(1.25, 0.25));
   EXPECT_DOUBLE_EQ(scheme.slope(), 4);
   EXPECT_DOUBLE_EQ(scheme.flow(9), 8);
@@ -80,7 +80,7 @@ TEST(TimeScheme, Bdf2IsExactForParabolasAndGas)
   inflate(0.1);
   double V0 = 0, V1 = 0, flow = 0;
   volume(V0);
-  PULMO_OK(scheme.begin(model, 1, V0, x));
+  PULMO_OK(scheme.begin(model, {1, V0, x}));
   PULMO_OK(TSRestartStep(ts));
   PULMO_OK(scheme.begin_stage(1.05, 0.1));
   EXPECT_NEAR(scheme.slope(), 20, 1e-12);
@@ -88,7 +88,7 @@ TEST(TimeScheme, Bdf2IsExactForParabolasAndGas)
   EXPECT_NEAR(flow, -20 * V0, 1e-9 * V0);
   inflate(0.13);
   volume(V1);
-  PULMO_OK(scheme.accept_stage(model, 1.05, V1, x));
+  PULMO_OK(scheme.accept_stage(model, {1.05, V1, x}));
   PULMO_OK(scheme.begin_stage(1.1, 0.1));
   EXPECT_NEAR(scheme.slope(), 30, 1e-11);
   EXPECT_NEAR(scheme.past_flow(), 10 * V0 - 40 * V1, 1e-9 * V0);
@@ -97,20 +97,20 @@ TEST(TimeScheme, Bdf2IsExactForParabolasAndGas)
 
   // steps of any size: exact for parabolas
   PULMO_OK(VecZeroEntries(x));
-  PULMO_OK(scheme.begin(model, 2, quadratic(2), x));
+  PULMO_OK(scheme.begin(model, {2, quadratic(2), x}));
   PULMO_OK(TSRestartStep(ts));
   PULMO_OK(scheme.begin_stage(2.05, 0.1));
-  PULMO_OK(scheme.accept_stage(model, 2.05, quadratic(2.05), x));
+  PULMO_OK(scheme.accept_stage(model, {2.05, quadratic(2.05), x}));
   PULMO_OK(scheme.begin_stage(2.1, 0.1));
   EXPECT_NEAR(scheme.flow(quadratic(2.1)), 2 - 10 * 2.1, 1e-11);
-  PULMO_OK(scheme.accept(model, 2.1, quadratic(2.1), x));
+  PULMO_OK(scheme.accept(model, {2.1, quadratic(2.1), x}));
   ts->steprestart = PETSC_FALSE;
   double t = 2.1;
   for (double dt : {0.04, 0.1, 0.01}) {
     t += dt;
     PULMO_OK(scheme.begin_stage(t, dt));
     EXPECT_NEAR(scheme.flow(quadratic(t)), 2 - 10 * t, 1e-10);
-    PULMO_OK(scheme.accept(model, t, quadratic(t), x));
+    PULMO_OK(scheme.accept(model, {t, quadratic(t), x}));
   }
   PULMO_OK(TSDestroy(&ts));
 }

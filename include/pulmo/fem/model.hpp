@@ -2,6 +2,7 @@
 /// The discrete model: fields, PetscDS, sections and constraints of a scene, residual and Jacobian.
 #pragma once
 
+#include "pulmo/fem/airway_nodes.hpp"
 #include "pulmo/fem/assembly.hpp"
 #include "pulmo/physics/effect.hpp"
 
@@ -35,9 +36,9 @@ public:
   void set_load(PetscReal load) { step_.load = load; }
   PetscReal load() const { return step_.load; }
   const Step &step() const { return step_; }
-  /// Whether the pressure is held on the surfaces open to the ventilator (so at the start), or free. Held nodes keep
-  /// their rows: identity in the Jacobian, x - value in the residual that close_rows() leaves.
-  void hold_airway(bool held) { airway_held_ = held; }
+  /// The nodes on the surfaces open to the ventilator. Held nodes keep their rows.
+  AirwayNodes &airway() { return airway_; }
+  const AirwayNodes &airway() const { return airway_; }
 
   /// Writes the prescribed values of time @p t into a local vector; with @p rate also (value - @p before) / dt.
   PetscErrorCode constrain(PetscReal t, Vec local) const;
@@ -46,9 +47,6 @@ public:
   /// Local residual, rows scaled. @p x and @p x_t are local vectors with constrained values in place. Rows of held
   /// nodes hold the flux that enters there.
   PetscErrorCode residual(PetscReal t, Vec x, Vec x_t, Vec F);
-  /// Where the airway is held: writes x - value into the rows of its nodes and of the carrier in a global residual. The
-  /// value is in place in every state that is integrated, so that this is zero unless @p X holds another.
-  PetscErrorCode close_rows(Vec X, Vec F) const;
   /// Sums of a global residual over the nodes, by field and in its units: kPa mm^2; mm^3/s.
   struct ResidualSums {
     std::vector<PetscReal> absolute, net;
@@ -66,23 +64,12 @@ public:
   /// Lets each Jacobian hand its element matrices to @p matrices, too, which must outlive the model.
   void also_fill(CellMatrices &matrices) { also_ = &matrices; }
 
-  /// The entry of a global vector that belongs to the one common pressure of the airway, where that is an unknown: a
-  /// node of the airway, or without airflow a dof of its own.
-  PetscErrorCode carrier_value(Vec X, PetscReal &value) const;
-  PetscErrorCode set_carrier_value(Vec X, PetscReal value) const;
-  /// Sets the pressure of all nodes of the airway, and of the carrier, in a global vector.
-  PetscErrorCode set_airway_nodes(Vec X, PetscReal value) const;
-  /// Mean pressure over the airway surfaces (eq. 48), kPa, from a local vector.
-  PetscErrorCode airway_mean_pressure(Vec local, PetscReal &mean) const;
   PetscErrorCode measure(Vec x, Measures &measures) const { return assembly_.measure(x, measures); }
   /// d(int (J - 1))/dx in direction @p y, mm^3 (local vectors).
   PetscErrorCode volume_derivative(Vec x, Vec y, PetscReal &derivative) const
   {
     return assembly_.volume_derivative(x, y, derivative);
   }
-  /// Flow into the lung, mm^3/s: the consistent flux, from a local residual. Where p is held the mass residual
-  /// is - int Q.N q; summed over the nodes where the lung is open it is exactly the rate of int (J - 1).
-  PetscErrorCode airway_flow(Vec F, PetscReal &flow) const;
   /// Force that each of the composition's constraints bears (a pin, a held surface), from a local residual, kPa mm^2:
   /// the sum of its displacement rows.
   PetscErrorCode reactions(Vec F, std::vector<std::array<PetscReal, 3>> &forces) const;
@@ -105,21 +92,12 @@ private:
     PetscReal x[3]; ///< mm
   };
 
-  /// A node of the pressure field on the surfaces open to the ventilator.
-  struct AirwayNode {
-    PetscInt point, dof; ///< mesh point; offset in the local vector
-    PetscInt row;        ///< in the global vector, -1 on ranks that do not own it
-    PetscReal area;      ///< integral of its basis function over this rank's facets, mm^2
-  };
-
   PetscErrorCode create_fields();
   PetscErrorCode create_weak_form();
   PetscErrorCode create_section();
   PetscErrorCode add_symmetries(PetscSection section) const;
   PetscErrorCode find_constraints(std::vector<PetscInt> &constraint_of);
   PetscErrorCode find_airway(const std::vector<PetscInt> &constraint_of);
-  PetscErrorCode find_carrier();
-  PetscErrorCode add_carrier(SectionHandle &section);
   PetscErrorCode pack_constants();
   PetscErrorCode add_volume_terms(PetscDS ds) const;
   /// PETSc's own loops over cells: constants are the same everywhere there.
@@ -135,14 +113,9 @@ private:
   std::vector<Prescribed> prescribed_;
   std::vector<PetscScalar> constants_;
   mutable std::vector<PetscScalar> local_constants_; ///< of constants_at()
-  std::vector<AirwayNode> airway_;
-  std::vector<PetscInt> closed_rows_; ///< global rows of held nodes (or of the carrier) that this rank owns
-  std::vector<PetscInt> idle_rows_;   ///< those of them that carry nothing
-  std::vector<ISHandle> field_rows_;  ///< global rows of each field that this rank owns
-  PetscReal airway_area_ = 0;         ///< mm^2
-  bool closes_rows_ = false, airway_held_ = true;
-  PetscInt carrier_ = -1; ///< global dof, -1 on ranks that do not own it
-  PetscMPIInt carrier_rank_ = 0;
+  AirwayNodes airway_;
+  bool closes_rows_ = false;         ///< the airway has rows that say nothing of a field while it is held
+  std::vector<ISHandle> field_rows_; ///< global rows of each field that this rank owns
   Step step_;
   PetscReal modulus_ = 1;
   std::vector<PetscReal> row_scale_;

@@ -67,6 +67,8 @@ private:
   double least_work() const;
   /// Adds the terms of @p part to @p sums (kPa mm^3, this rank).
   PetscErrorCode integrate(const Part &part, const StepReport &step, std::vector<double> &sums);
+  /// Adds the terms of the scalars to @p sums (kPa mm^3, all ranks).
+  void add_scalars(const StepReport &step, std::vector<double> &sums);
   /// Adds the work of supports that move (this rank).
   PetscErrorCode add_support_work(const StepReport &step, double &sum);
 

@@ -65,9 +65,12 @@ private:
 /// Writes signals.csv.part row by row and renames it at the end.
 class SignalWriter final : public Observer {
 public:
-  SignalWriter(MPI_Comm comm, const Output &output, const SceneFacts &facts)
+  SignalWriter(MPI_Comm comm, const Output &output, const SceneFacts &facts, const Composition &composition)
       : comm_(comm), output_(output), facts_(facts)
-  {}
+  {
+    for (const ScalarGroup &group : composition.scalar_groups())
+      scalars_.insert(scalars_.end(), group.scalars.begin(), group.scalars.end());
+  }
   ~SignalWriter() override;
   PetscErrorCode observe(const StepReport &step) override;
   PetscErrorCode finish();
@@ -76,6 +79,7 @@ private:
   MPI_Comm comm_;
   const Output &output_;
   const SceneFacts &facts_;
+  std::vector<ScalarSpec> scalars_; ///< each has columns of its own
   std::FILE *file_ = nullptr;
 };
 

@@ -6,8 +6,10 @@
 
 #include "pulmo/input/programme.hpp"
 #include "pulmo/mesh/elements.hpp"
+#include "pulmo/physics/partner.hpp"
 #include "pulmo/physics/permeability.hpp"
 #include "pulmo/physics/point.hpp"
+#include "pulmo/physics/scalars.hpp"
 #include "pulmo/physics/tissue_law.hpp"
 
 #include <algorithm>
@@ -130,6 +132,22 @@ static inline PetscScalar numerical_gas_loss(const Point &now, const Point &befo
   return now.gas_pressure() * volume_beyond_linear(now.state.F, D);
 }
 
+/// The scalar unknowns of one effect (pulmo/physics/scalars.hpp).
+struct ScalarGroup {
+  std::string effect;
+  std::vector<ScalarSpec> scalars;
+  ScalarEquations equations;
+  std::size_t offset = 0; ///< number of the first one among those of all effects
+};
+
+/// A share of the energy balance that scalars have.
+struct ScalarEnergyTerm {
+  std::string effect;
+  Energy kind;
+  std::string account;
+  ScalarEnergy energy;
+};
+
 /// A block of kernel parameters that lives in an effect and is copied into PetscDS before each evaluation.
 struct ParameterBlock {
   const char *owner;
@@ -223,6 +241,21 @@ public:
   {
     return memories_.empty() ? 0 : memories_.back().offset + static_cast<PetscInt>(memories_.back().quantities.size());
   }
+  /// Adds scalar unknowns and as many equations.
+  void scalars(std::vector<ScalarSpec> list, ScalarEquations equations)
+  {
+    scalar_groups_.push_back({effect_, std::move(list), std::move(equations), n_scalars_});
+    n_scalars_ += scalar_groups_.back().scalars.size();
+  }
+  const std::vector<ScalarGroup> &scalar_groups() const { return scalar_groups_; }
+  /// Scalar unknowns of all effects; the pressure at the airway opening is not among them.
+  std::size_t n_scalars() const { return n_scalars_; }
+  /// A term of the energy balance for what the scalars of the effect that speaks do.
+  void scalar_energy(Energy kind, const std::string &account, ScalarEnergy energy)
+  {
+    scalar_energies_.push_back({effect_, kind, account, std::move(energy)});
+  }
+  const std::vector<ScalarEnergyTerm> &scalar_energies() const { return scalar_energies_; }
   void constrain(Constraint c)
   {
     c.effect = effect_;
@@ -337,6 +370,9 @@ private:
   std::vector<ParameterBlock> parameters_;
   std::vector<Reader> readers_;
   std::vector<MemorySpec> memories_;
+  std::vector<ScalarGroup> scalar_groups_;
+  std::vector<ScalarEnergyTerm> scalar_energies_;
+  std::size_t n_scalars_ = 0;
   std::shared_ptr<const ParameterFields> varying_;
 };
 
@@ -382,17 +418,19 @@ struct SceneFacts {
   Settling settling;
   FlowSplit flow_split = FlowSplit::automatic;
   std::optional<AirwayResistance> tube; ///< between ventilator and airway
+  bool airway_tree = false;             ///< branches between the airway opening and the surfaces open to it
   bool pressure_damping = false;        ///< oscillations of the pressure are damped
 
   /// Whether some phase leaves the airway's pressure field free, with its flux prescribed.
   bool free_airway() const
   {
-    return airflow && ventilator && ventilator->prescribes_flow() && flow_split == FlowSplit::uniform;
+    return airflow && ventilator && ventilator->prescribes_flow() && flow_split == FlowSplit::uniform && !airway_tree;
   }
-  /// Whether some phase has one pressure of the whole airway (without airflow: of all gas) as an unknown of its own.
-  bool common_pressure() const
+  /// Whether some phase has the pressure at the airway opening (without airflow: of all gas) as an unknown of its own.
+  bool unknown_opening_pressure() const
   {
-    return ventilator && (tube || ventilator->limits_pressure() || (ventilator->prescribes_flow() && !free_airway()));
+    return ventilator &&
+           (airway_tree || tube || ventilator->limits_pressure() || (ventilator->prescribes_flow() && !free_airway()));
   }
 };
 
@@ -421,8 +459,10 @@ public:
   virtual PetscErrorCode check(const Options &, const Mesh &, const SceneFacts &) { return PETSC_SUCCESS; }
   /// Adds its fields.
   virtual void fields(Composition &) const {}
-  /// Adds its parameters, terms and constraints.
+  /// Adds its parameters, terms, constraints, memory and scalars.
   virtual PetscErrorCode terms(Composition &, const SceneFacts &) const { return PETSC_SUCCESS; }
+  /// Who has a past or a say in the steps of a run; they must not outlive the effect.
+  virtual std::vector<std::unique_ptr<Partner>> partners(const SceneFacts &) const { return {}; }
 };
 
 } // namespace pulmo

@@ -1,9 +1,10 @@
 /// @file
-/// The condition at the airway: what the phase at hand prescribes there, and the one equation that goes with a pressure
-/// that is an unknown of its own.
+/// The condition at the airway opening: what the phase at hand prescribes there, and the one equation that goes with a
+/// pressure that is an unknown.
 #pragma once
 
-#include "pulmo/fem/archive.hpp"
+#include "pulmo/fem/scalar_unknowns.hpp"
+#include "pulmo/physics/partner.hpp"
 #include "pulmo/time/step_control.hpp"
 #include "pulmo/time/time_scheme.hpp"
 
@@ -13,75 +14,75 @@ namespace pulmo {
 ///
 /// held    the pressure is prescribed on the open surfaces;
 /// free    the flux is prescribed there, by area, and the pressure field is free;
-/// common  the whole airway (without airflow: all gas) has one pressure P, the unknown of one scalar equation c = 0:
-///         a prescribed volume, (V - V_target) / h^3, or the tube's drop, (P + K1 Q + K2 |Q| Q - P_ventilator) /
-///         modulus.
+/// solved  the pressure P at the opening (without airflow: of all gas) is the unknown of one scalar equation c = 0: a
+///         prescribed volume, (V - V_target) / h^3, or what is prescribed at the ventilator,
+///         (P + K1 Q + K2 |Q| Q - P_ventilator) / modulus. The open surfaces have that pressure, or those that an
+///         airway tree gives them.
 ///
 /// A flow phase prescribes the volume at the end of each step, so that errors of the solver do not add up.
-class Airway {
+class Airway final : public Partner {
 public:
-  enum class Mode { held, free, common };
+  enum class Mode { held, free, solved };
 
-  /// @p scheme: where rates of volume come from.
+  /// @p scheme: where rates come from.
   Airway(Model &model, const SceneFacts &facts, const TimeScheme &scheme)
-      : model_(model), facts_(facts), scheme_(scheme)
+      : model_(model), facts_(facts), scheme_(scheme), scalars_(model)
   {}
 
+  const char *name() const override { return "airway"; }
+  /// The run begins at rest.
+  void start() { before_.assign(scalars_.size(), 0); }
   /// Begins a phase at lung volume @p volume (mm^3 above rest) whose first step is to take @p first_step s. A ramp of
   /// pressure without a start value starts from what the ventilator has then.
   void begin_phase(const Phase &phase, PetscReal volume, PetscReal first_step);
-  /// Writes or reads what a step needs of the phase and of the steps before it; the phase was begun.
-  PetscErrorCode persist(Archive &archive);
-  /// After persist() has read: puts a gas pressure that has no node into a global vector.
-  PetscErrorCode restore(Vec X) const
-  {
-    return model_.composition().common_gas_pressure() ? model_.set_carrier_value(X, pressure_before_) : PETSC_SUCCESS;
-  }
-  /// Begins an attempt at a stage that ends at @p t, of a step that ends at @p step_end, s; the scheme has begun it.
-  void begin_stage(PetscReal t, PetscReal step_end);
-  /// The attempt at hand failed and is made once more, as it was.
-  void again() { retake_ = limited_; }
-  /// The attempt at hand failed and a shorter one is made: that may stay below the limit.
-  void cut() { retake_ = false; }
-  /// Whether the step at hand is the first one that holds the limit of the phase.
-  bool reaches_limit() const { return limited_ && !limited_before_; }
-  /// Puts the prescribed pressure, or the last known one, into a global vector.
+  /// The scheme has begun the stage.
+  void begin(PetscReal t, PetscReal step_end) override;
+  /// Asks for the step again, with the limit of the phase held, if the ventilator's pressure exceeds that (to the end
+  /// of the phase, if such an attempt is accepted): a shorter one would let the flow overshoot.
+  Verdict judge(const Attempt &attempt) override;
+  void reject(Verdict how) override { retake_ = how == Verdict::again && (limited_ || exceeds_); }
+  void accept(const Attempt &attempt) override;
+  /// What a step needs of the phase and of the steps before it; the phase was begun.
+  PetscErrorCode past(Past &past) override;
+  /// After past() has read: puts scalars that have no node into a global vector.
+  PetscErrorCode restore(Vec X) const;
+
+  /// Puts the prescribed pressure, or the last known ones, into a global vector.
   PetscErrorCode guess(Vec X) const;
-  /// Hands the step to the model; where P is an unknown its value is that of @p X.
+  /// Makes an increment of the state one that Newton may take: held pressures do not change, unknown ones by one value.
+  PetscErrorCode hold(Vec increment) const;
+  /// Hands the step to the model; what is unknown has its value in @p X.
   PetscErrorCode apply(Vec X);
-  /// Writes the scalar equation at lung volume @p volume into its row of a global residual at @p X.
-  PetscErrorCode close(PetscReal volume, Vec X, Vec F);
-  /// Holds a P that is an unknown at its last value for as long as @p frozen: the assembled Jacobian is that of the
-  /// residual without P and its equation.
-  bool frozen() const { return frozen_; }
-  void freeze(bool frozen) { frozen_ = frozen && mode_ == Mode::common; }
-  /// Change of P in a Newton step, kPa, from the equation's value @p c, its derivative @p c_P and the changes of
-  /// volume (mm^3) along the step for fixed P and per kPa.
-  PetscReal change(PetscReal c, PetscReal c_P, PetscReal volume_fixed, PetscReal volume_per_P) const;
+  /// Closes the rows of the airway in a global residual at @p X; @p volume: of the lung, mm^3 above rest; @p local_F:
+  /// the local residual.
+  PetscErrorCode close(PetscReal volume, Vec local_F, Vec X, Vec F);
+  /// Completes a Newton step (ScalarUnknowns::complete).
+  PetscErrorCode complete(SNES snes, Mat A, Vec X, Vec Y, Vec local, PetscInt &krylov)
+  {
+    return scalars_.complete(snes, equation(), A, X, Y, local, krylov);
+  }
+  /// The equation of the opening in the step at hand.
+  ScalarUnknowns::OpeningEquation equation() const;
+  ScalarUnknowns &scalars() { return scalars_; }
+  const ScalarUnknowns &scalars() const { return scalars_; }
+
   /// Whether the volume of a flow phase was met when close() was called last.
   bool satisfied() const;
-  /// By how much lung volume @p volume misses what the phase prescribes: mm^3, or kPa at the ventilator.
+  /// By how much a solved step at lung volume @p volume and local residual @p local_F misses what is prescribed: mm^3,
+  /// or kPa at the ventilator or in the equations of scalars.
   struct Unmet {
     PetscReal volume = 0, pressure = 0;
   };
-  Unmet unmet(PetscReal volume) const;
-  /// Takes note of an accepted step with flow @p flow, mm^3/s.
-  void accept(PetscReal flow)
-  {
-    pressure_before_ = pressure_;
-    ventilator_before_ = ventilator_pressure(flow);
-    limited_before_ = limited_;
-  }
-  /// Pressure at the airway, kPa: what is held, the unknown, or the mean over the free surface.
+  PetscErrorCode unmet(PetscReal volume, Vec local_F, Unmet &unmet);
+  /// Pressure at the opening, kPa: what is held, the unknown, or the mean over the free surface.
   PetscErrorCode pressure(Vec local, PetscReal &pressure);
-  /// Pressure at the ventilator's side of the tube, kPa, at flow @p flow into the lung, mm^3/s.
+  /// Flow through the opening, where @p flow enters the lung, mm^3/s.
+  PetscReal opening_flow(PetscReal flow) const { return flow + scalars_.stored(scalars_.rates()); }
+  /// Pressure at the ventilator's side of the tube, kPa, at flow @p flow through the opening, mm^3/s.
   PetscReal ventilator_pressure(PetscReal flow) const
   {
     return pressure_ + (facts_.tube ? facts_.tube->drop(flow) : 0);
   }
-  /// If the phase has a limit that the ventilator's pressure exceeds: holds the limit in the next attempt (and, if that
-  /// is accepted, to the end of the phase) and tells so.
-  bool limit(PetscReal flow);
   /// Whether the volume is held: a prescribed flow of zero.
   bool holds_volume() const { return control() == Control::flow && phase_.to == 0 && phase_.ramp == 0; }
 
@@ -97,20 +98,25 @@ private:
   void set_mode();
   /// The pressure that the phase prescribes, kPa.
   PetscReal prescribed_pressure(PetscReal t, PetscReal step_end) const;
+  /// Rate of the gas beyond the opening at volume @p gas of it (mm^3 above rest), mm^3/s.
+  PetscReal gas_flow(PetscReal gas) const { return scheme_.slope() * gas + past_flow_; }
 
   Model &model_;
   const SceneFacts &facts_;
   const TimeScheme &scheme_;
+  ScalarUnknowns scalars_;
+  std::vector<PetscReal> before_ = {0}; ///< scalars before the step, kPa
   Phase phase_;
   Mode mode_ = Mode::held;
   bool limited_ = false, limited_before_ = false; ///< the limit is held now, was held in the step before
-  bool frozen_ = false;                           ///< freeze()
+  bool exceeds_ = false;                          ///< the attempt judged last exceeds it
   bool retake_ = false;                           ///< the next attempt is the first one with the limit held
-  PetscReal pressure_ = 0, pressure_before_ = 0;  ///< at the airway now, before the step, kPa
+  PetscReal pressure_ = 0;                        ///< at the opening now, kPa
   PetscReal ventilator_before_ = 0;               ///< at the ventilator before the step, kPa
   PetscReal target_ = 0;                          ///< pressure that the phase prescribes, kPa
-  PetscReal volume_begin_ = 0;                    ///< at the begin of the phase, mm^3
-  PetscReal volume_target_ = 0, volume_ = 0;      ///< prescribed; at the last close(), mm^3
+  PetscReal volume_begin_ = 0;                    ///< of the gas at the begin of the phase, mm^3
+  PetscReal volume_target_ = 0, volume_ = 0;      ///< of the gas: prescribed; at the last close(), mm^3
+  PetscReal past_flow_ = 0;                       ///< share of the past in the rate of that, mm^3/s
   PetscReal first_step_ = 0;                      ///< of the phase, s
 };
 

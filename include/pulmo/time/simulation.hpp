@@ -76,10 +76,10 @@ public:
   PetscErrorCode before_stage(PetscReal t);
   /// First guess of a step; comes as the state before it.
   PetscErrorCode guess(SNES snes, Vec X);
-  /// Completes the Newton step @p Y of a solution @p X whose airway pressure is an unknown: one more right-hand side.
+  /// Completes the Newton step @p Y of a solution @p X where scalars are unknown.
   PetscErrorCode border(SNES snes, Vec X, Vec Y);
   /// The matrix times @p x. Along a bordered step the rate of change of the residual is minus the residual, as along
-  /// any Newton step; the matrix lacks the column and the row of the airway pressure.
+  /// any Newton step; the matrix lacks the columns and the rows of the scalars.
   PetscErrorCode product(Vec x, Vec y);
   /// PETSc's test, but a prescribed volume must be met too.
   PetscErrorCode converged(SNES snes, PetscInt it, PetscReal xnorm, PetscReal ynorm, PetscReal fnorm,
@@ -113,6 +113,13 @@ private:
   PetscErrorCode make_rate();
   PetscErrorCode local_residual(PetscReal t);
   PetscErrorCode scatter(PetscReal t, Vec X, Vec Xdot);
+  Moment moment(PetscReal t, PetscReal volume, Vec local) const
+  {
+    return {t, volume, local, airway_.scalars().of_effects() ? airway_.scalars().values() : std::vector<PetscReal>()};
+  }
+  PetscErrorCode ask_partners(const Attempt &attempt, PetscBool *accept);
+  PetscErrorCode past_of_partners(Archive &archive);
+  void list_scalars(SignalRow &row) const;
   PetscErrorCode judge(PetscReal t, PetscReal volume, PetscReal pressure, bool &solved);
   PetscErrorCode consistent_flow(PetscReal &flow) const;
   PetscErrorCode keep_step(PetscReal dt);
@@ -140,6 +147,9 @@ private:
   Model &model_;
   TimeScheme scheme_;
   Airway airway_;
+  std::vector<std::unique_ptr<Partner>> effect_partners_;
+  std::vector<Partner *> partners_; ///< the airway and those of effects
+  bool kink_ = false;               ///< a partner saw one in the attempt judged last
   StepControl step_control_;
   StepControl::Value candidate_; ///< at the end of the step that is to be accepted
   Balance balance_;
@@ -153,7 +163,6 @@ private:
   TSHandle ts_;
   MatHandle matrix_;
   VecHandle state_, local_, rate_, local_residual_, before_;
-  VecHandle border_x_, border_b_, border_z_, border_r_, border_y_; ///< global; the last one local
   std::vector<Phase> phases_;
   std::set<std::string> low_limits_; ///< lines of the programme that were warned of
   const Phase *phase_ = nullptr;

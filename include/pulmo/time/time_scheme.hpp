@@ -7,8 +7,16 @@
 #include "pulmo/fem/point_memory.hpp"
 
 #include <array>
+#include <vector>
 
 namespace pulmo {
+
+/// A state that a rate may look back at.
+struct Moment {
+  PetscReal time = 0, volume = 0;      ///< s; mm^3 above rest
+  Vec local = nullptr;                 ///< the fields, constrained values in place
+  std::vector<PetscReal> scalars = {}; ///< kPa (ScalarUnknowns)
+};
 
 /// Keeps the past that a rate is made of: dy/dt = slope y + sum w_i y_i (LeVeque 2007, Finite Difference Methods for
 /// Ordinary and Partial Differential Equations, section 8.6; weights for any step sizes from Lagrange's polynomials).
@@ -27,18 +35,17 @@ public:
   bool half_step() const { return half_; }
   int order() const { return multistep_ ? 2 : 1; }
 
-  /// Begins with the state @p local of volume @p volume (mm^3 above rest) at time @p t.
-  PetscErrorCode begin(Model &model, PetscReal t, PetscReal volume, Vec local);
-  /// Writes or reads the past; the arguments as for begin(), of the last accepted step.
-  PetscErrorCode persist(Archive &archive, Model &model, PetscReal t, PetscReal volume, Vec local);
+  PetscErrorCode begin(Model &model, const Moment &start);
+  /// Writes or reads the past; @p last: of the last accepted step.
+  PetscErrorCode persist(Archive &archive, Model &model, const Moment &last);
   /// Before the first step of a TSSolve: lets it look back on what was read, or on nothing.
   PetscErrorCode begin_solve(PetscInt steps);
   /// Begins a stage that ends at time @p t of a step of size @p dt, s.
   PetscErrorCode begin_stage(PetscReal t, PetscReal dt);
   /// Takes note of the solution of the stage at hand if it is the half step of a restart.
-  PetscErrorCode accept_stage(Model &model, PetscReal t, PetscReal volume, Vec local);
+  PetscErrorCode accept_stage(Model &model, const Moment &now);
   /// Takes note of an accepted step.
-  PetscErrorCode accept(Model &model, PetscReal t, PetscReal volume, Vec local);
+  PetscErrorCode accept(Model &model, const Moment &now);
 
   PetscReal slope() const { return slope_; } ///< 1/s
   /// What kernels are told of the stage at hand.
@@ -52,8 +59,9 @@ public:
   }
   /// Rate of the fields at the local state @p now, constrained values in place.
   PetscErrorCode rate(Vec now, Vec rate) const;
-  /// The share of the past in the rate of volume, mm^3/s.
+  /// The share of the past in the rate of volume, mm^3/s, and in those of the scalars, kPa/s.
   PetscReal past_flow() const;
+  std::vector<PetscReal> past_rates() const;
   /// Rate of volume at @p volume, mm^3/s.
   PetscReal flow(PetscReal volume) const { return slope_ * volume + past_flow(); }
   /// Adds the share of the past to the mass rows of a local residual of @p model.
@@ -62,12 +70,13 @@ public:
 private:
   struct Past {
     PetscReal time = 0, volume = 0; ///< s, mm^3
+    std::vector<PetscReal> scalars; ///< kPa
     VecHandle state;                ///< local; with more than one state before
     VecHandle gas;                  ///< local: its int (J - 1) q in the mass rows, mm^3
   };
 
-  /// Fills @p past with the state @p local.
-  PetscErrorCode keep(Model &model, PetscReal t, PetscReal volume, Vec local, Past &past);
+  /// Fills @p past with the state @p now.
+  PetscErrorCode keep(Model &model, const Moment &now, Past &past);
 
   TS ts_ = nullptr;
   bool multistep_ = false, gas_ = false; ///< BDF; and there is a mass balance

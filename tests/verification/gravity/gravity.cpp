@@ -340,7 +340,7 @@ TEST(Gravity, JacobianAgainstDifferencesWithAirflow)
     constexpr double h = 1e-4, shift = 2.3;
     PULMO_OK(prepare(run, scene.options()));
     PULMO_OK(random_state(run, 11, s));
-    run.model().hold_airway(false);
+    run.model().airway().hold(false);
     PULMO_OK(DMCreateMatrix(run.model().dm(), A.out()));
     PULMO_OK(run.model().jacobian(s.t, s.x, s.x_t, shift, A));
     PULMO_OK(DMCreateGlobalVector(run.model().dm(), d.out()));

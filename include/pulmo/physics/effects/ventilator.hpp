@@ -135,7 +135,7 @@ public:
     if (!facts.airflow) {
       c.residual("-J p F^-T : Grad eta", displacement, f1(volume_residual<P, K::gas_stress>));
       c.jacobian("gas stress", displacement, displacement, g3(volume_jacobian<P, K::gas_stress_by_displacement>));
-      if (facts.common_pressure()) c.solve_for_gas_pressure();
+      if (facts.unknown_opening_pressure()) c.solve_for_gas_pressure();
       c.energy(Energy::numerical, "numerical_dissipation", "", energy_density<P, numerical_gas_loss>);
     }
     if (facts.free_airway())
