@@ -1,6 +1,7 @@
 #include "pulmo/physics/registry.hpp"
 
 #include "pulmo/physics/effects/airflow.hpp"
+#include "pulmo/physics/effects/airway_tree.hpp"
 #include "pulmo/physics/effects/chest_wall.hpp"
 #include "pulmo/physics/effects/gravity.hpp"
 #include "pulmo/physics/effects/lumen_pressure.hpp"
@@ -29,6 +30,7 @@ Registry Registry::standard()
   // permeability laws; the first is the default
   r.permeability_law<ConstantPermeability>();
   // effects beside tissue, airflow and ventilator
+  r.effect<AirwayTree>();
   r.effect<ChestWall>();
   r.effect<Gravity>();
   r.effect<LumenPressure>();
