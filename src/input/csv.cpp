@@ -7,6 +7,8 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstdint>
+#include <cstdio>
 #include <cstdlib>
 
 namespace pulmo {
@@ -121,12 +123,17 @@ PetscErrorCode Csv::number(std::size_t row, const std::string &column, Range ran
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-std::string Csv::content() const
+std::string Csv::hash() const
 {
-  std::string text;
+  std::uint64_t h = 0xcbf29ce484222325U; // FNV-1a
+  const auto add = [&h](const std::string &text) {
+    for (const char c : text + '\n') h = (h ^ static_cast<unsigned char>(c)) * 0x100000001b3U;
+  };
   for (std::size_t row = 0; row < rows_.size(); ++row)
     for (const auto &[column, place] : columns_)
-      if (!rows_[row][place].empty()) text += std::to_string(row) + "," + column + "," + rows_[row][place] + "\n";
+      if (!rows_[row][place].empty()) add(std::to_string(row) + "," + column + "," + rows_[row][place]);
+  char text[32];
+  std::snprintf(text, sizeof(text), "hash %016llx", static_cast<unsigned long long>(h));
   return text;
 }
 

@@ -31,8 +31,8 @@ public:
   std::string where(std::size_t row) const { return file_ + ":" + std::to_string(lines_[row]); }
   /// The number in a cell; none where it is empty. User error where it is no number, or outside @p range.
   PetscErrorCode number(std::size_t row, const std::string &column, Range range, std::optional<PetscReal> &value) const;
-  /// All cells as text: two tables that say the same have the same.
-  std::string content() const;
+  /// Of all cells: two tables that say the same have the same.
+  std::string hash() const;
 
 private:
   MPI_Comm comm_ = MPI_COMM_NULL;

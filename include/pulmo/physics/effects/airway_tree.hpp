@@ -136,7 +136,7 @@ public:
                           {"name", "parent", "length_mm", "diameter_mm", "resistance_cmH2O_s_per_l",
                            "compliance_ml_per_cmH2O", "surface", "region"},
                           table_));
-      options.note_content("-airway_tree", table_.content());
+      options.note_content("-airway_tree", "a table, " + table_.hash());
     }
     PetscFunctionReturn(PETSC_SUCCESS);
   }
@@ -175,8 +175,11 @@ public:
                        branch.name.c_str(), part.surface.c_str());
         const bool known = part.region.empty() || std::any_of(regions.begin(), regions.end(),
                                                               [&](const auto &r) { return r.name == part.region; });
-        PulmoUserCheck(known, comm, "-airway_tree: branch '%s' ends in '%s', and the mesh has no volume of that name",
-                       branch.name.c_str(), part.region.c_str());
+        std::string names;
+        for (const auto &r : regions) names += (names.empty() ? "" : ", ") + r.name;
+        PulmoUserCheck(known, comm,
+                       "-airway_tree: branch '%s' ends in '%s', and the mesh has no volume of that name; it has: %s",
+                       branch.name.c_str(), part.region.c_str(), names.c_str());
       }
     network_ = std::make_shared<AirwayNetwork>(std::move(branches));
     PetscFunctionReturn(PETSC_SUCCESS);
