@@ -330,6 +330,23 @@ class Tools(unittest.TestCase):
         self.assertTrue(keys.make_mesh(path, "sphere_mesh", words))
         self.assertEqual([f for f in os.listdir(path.parent) if f.startswith("part")], [])
 
+    def test_a_script_is_known_by_its_modules(self):
+        """What a script imports from folders beside it, also by way of one of them, is part of its key."""
+        folder = pathlib.Path(pulmo.scratch())
+        for name, text in (("door", "#!/usr/bin/python3\nfrom near import one\n"), ("near/one.py", "import os\nfrom far.two import x\n"),
+                           ("far/two.py", "x = 1\n"), ("other/three.py", "")):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_text(text)
+        (folder / "door").chmod(0o755)
+        known = keys.digest([folder / "door"])
+        (folder / "other/three.py").write_text("y = 1\n")
+        self.assertEqual(keys.digest([folder / "door"]), known)
+        (folder / "far/two.py").write_text("x = 2\n")
+        self.assertNotEqual(keys.digest([folder / "door"]), known)
+        made_by = [os.path.relpath(path, os.path.join(pulmo.SOURCE, "tools")) for path in keys.modules(
+            os.path.join(pulmo.SOURCE, "tools/lung_mesh"))]
+        self.assertIn("meshing/shape.py", made_by)
+
     def test_tools_lock_their_folders(self):
         """Two calls in one folder: the second ends and names the first."""
         folder = pulmo.scratch()

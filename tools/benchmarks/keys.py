@@ -1,8 +1,8 @@
 """What a finished run is known by, and who may write where: shared by all tools that keep runs.
 
-A key covers the words of the command, the content of every file that the run reads (programs, their libraries by name, size and
-time, meshes, option files and all that those name, to any depth, ~/.petscrc and .petscrc) and the variables that PETSc, MPI and BLAS
-listen to. What changes any of them makes a new run.
+A key covers the words of the command, the content of every file that the run reads (programs, modules of scripts, libraries by name,
+size and time, meshes, option files and all that those name, to any depth, ~/.petscrc and .petscrc) and the variables that PETSc, MPI
+and BLAS listen to. What changes any of them makes a new run.
 """
 import fcntl
 import functools
@@ -67,12 +67,26 @@ def libraries(program):
     return [f"{path} {os.stat(path).st_size} {os.stat(path).st_mtime_ns}" for path in paths if os.path.isfile(path)]
 
 
+def modules(program):
+    """Python files that a script runs on: those of the folders beside it that it, or one of them, imports from."""
+    found, waiting = set(), [Path(program)]
+    while waiting:
+        text = waiting.pop().read_bytes()
+        if found or text.startswith(b"#!"):
+            for name in re.findall(rb"^(?:from|import) (\w+)", text, re.MULTILINE):
+                new = set((Path(program).parent / name.decode()).glob("*.py")) - found
+                found |= new
+                waiting += new
+    return sorted(map(str, found))
+
+
 def digest(words, environment=None, directory=""):
     """A short name for a command and all that its run depends on. environment and directory: those of the run (default: those of all
     tools, and the current one)."""
     words, environment = [str(word) for word in words], environment or plain_environment()
     variables = {name: value for name, value in environment.items() if name.startswith(LISTENED)}
     programs = list(dict.fromkeys(path for word in words if (path := shutil.which(word))))
+    programs += [path for program in programs for path in modules(program)]
     named = [*words, *words_of(environment.get("PETSC_OPTIONS", "")), *words_of(environment.get("PETSC_OPTIONS_YAML", "")),
              *(os.path.expanduser(path) for path in RC_FILES)]
     content = hashlib.sha256()

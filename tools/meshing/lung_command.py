@@ -1,0 +1,180 @@
+"""The command line of tools/lung_mesh: what may be asked for, defaults, a number of cells, sizes by an earlier run."""
+import argparse
+import math
+import os
+import sys
+from dataclasses import replace
+
+import numpy as np
+
+from .geometry import tet_volumes
+from .lungs import SIDES, Options, make_lungs
+from .mesh import LungMeshError
+from .msh import write_mesh
+from .picture import picture
+from .report import measures, print_report
+from .shape import BRONCHUS_RADIUS, TEMPLATE_VOLUME
+from .size_field import read_size_field
+
+DEFAULT_VOLUME = {"right": 1404.0, "left": 1196.0, "both": 2600.0}  # ml
+DEFAULT_SIZE = 15.0     # mm, in a lung of the default volume
+AIRWAY_SIZE = {"hilum": 8.0, "main": 3.0, "lobar": 4.0}  # mm, likewise
+LUNG_VOLUMES = (1e-3, 1e7)  # ml, of any animal
+TET = 0.118             # volume of a tetrahedron over that of the cube of its edge
+BYTES = 3000            # of memory that a tetrahedron takes on the way
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors are one sentence."""
+
+    def error(self, message):
+        self.exit(2, f"lung_mesh: {message}; see --help.\n")
+
+
+def positive(text):
+    """A positive finite number of the command line."""
+    value = float(text)
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    return value
+
+
+def count(text):
+    """A positive whole number of the command line."""
+    value = int(text)
+    if value <= 0:
+        raise argparse.ArgumentTypeError(f"{text} is not a positive whole number")
+    return value
+
+
+def parse(arguments):
+    """The command line's options."""
+    parser = Parser(prog="lung_mesh", description=(
+        "Make a tetrahedral mesh of parametric human lungs (axes RAS, mm) with the surfaces airway and pleura "
+        "and the volumes right_lung and left_lung."), epilog=(
+        "Sizes and volumes are those of the mesh at rest. The default sizes are for the default volumes and "
+        "follow the size of the lung. The exit code is 0 only if a mesh that passed its checks was written."))
+    parser.add_argument("--side", choices=SIDES, default="both", help="which lung (default: both)")
+    parser.add_argument("--volume", type=positive, metavar="ML",
+                        help="volume of the whole mesh, ml (default: both 2600, right 1404, left 1196)")
+    size = parser.add_mutually_exclusive_group()
+    size.add_argument("--size", type=positive, metavar="MM",
+                      help=f"element size away from the airway and the sharp borders, mm (default: {DEFAULT_SIZE:g})")
+    size.add_argument("--cells", type=count, metavar="N",
+                      help="aim at N tetrahedra (within 10 %%) instead of a size")
+    parser.add_argument("--size-field", metavar="FILE.xdmf", help=(
+        "let the sizes follow the error indicators in the fields.xdmf of a run (-output_fields_error_indicator) on a "
+        "mesh of the same lungs; as many tetrahedra as there unless --cells is given"))
+    parser.add_argument("--airway", choices=list(AIRWAY_SIZE), default="main",
+                        help="a hilum patch, a carved main bronchus, or carved lobar bronchi too (default: main)")
+    parser.add_argument("--airway-size", type=positive, metavar="MM", help=(
+        "element size at the airway, mm (default: " + ", ".join(f"{a} {h:g}" for a, h in AIRWAY_SIZE.items()) + ")"))
+    parser.add_argument("--bronchus-radius", type=positive, metavar="MM", default=BRONCHUS_RADIUS, help=(
+        "radius of the carved main bronchi, mm in a pair of "
+        f"{TEMPLATE_VOLUME:g} ml (default: {BRONCHUS_RADIUS:g}; sets the airway's area)"))
+    parser.add_argument("--output", metavar="FILE.msh", default="lung.msh", help="mesh to write (default: lung.msh)")
+    parser.add_argument("--format", choices=["4.1", "2.2"], default="4.1", help="version of MSH (default: 4.1)")
+    kind = parser.add_mutually_exclusive_group()
+    kind.add_argument("--ascii", action="store_true", help="write text (the default, and the shorter file)")
+    kind.add_argument("--binary", action="store_true", help="write binary")
+    parser.add_argument("--picture", metavar="FILE.png", help="draw the mesh too")
+    return parser.parse_args(arguments)
+
+
+def check_request(given, volume, stretch):
+    """Refuse at once what cannot be met by far; stretch: of the template. What is left is checked on the lung itself."""
+    least, largest = LUNG_VOLUMES
+    if not least <= volume <= largest:
+        raise LungMeshError(f"--volume {volume:g} ml is outside {least:g} to {largest:g} ml; a mouse has 0.2 ml, a man 4000 ml.")
+    for option, size in (("--size", given.size), ("--airway-size", given.airway_size)):
+        if size and not 0.5 * stretch <= size <= 64 * stretch:
+            raise LungMeshError(f"{option} {size:g} mm is no size that a lung of {volume:g} ml can be meshed with; it takes about "
+                                f"{3 * stretch:.3g} to {32 * stretch:.3g} mm.")
+    fewest, most = (volume * 1e3 / (TET * (size * stretch) ** 3) for size in (64, 2))
+    if given.cells and not fewest <= given.cells <= most:
+        raise LungMeshError(f"--cells {given.cells} is outside {fewest:.0f} to {most:.2g}, what a lung of any volume can be meshed with.")
+    wanted = given.cells or volume * 1e3 / (TET * (given.size or DEFAULT_SIZE * stretch) ** 3)
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    if wanted * BYTES > memory:
+        raise LungMeshError(f"about {wanted:.2g} tetrahedra take {wanted * BYTES / 1e9:.2g} GB; this machine has {memory / 1e9:.2g} GB: "
+                            "take fewer.")
+
+
+def filled_in(given):
+    """The Options of a parsed command line, with the defaults that depend on the volume."""
+    if given.size_field and (given.size or given.airway_size):
+        raise LungMeshError("--size and --airway-size have no meaning with --size-field; give --cells.")
+    volume = given.volume or DEFAULT_VOLUME[given.side]
+    stretch = (volume / DEFAULT_VOLUME[given.side]) ** (1 / 3)
+    check_request(given, volume, stretch)
+    size = given.size or DEFAULT_SIZE * stretch
+    airway_size = given.airway_size or min(AIRWAY_SIZE[given.airway] * stretch, size)
+    for option, path, ending in (("--output", given.output, ".msh"), ("--picture", given.picture, ".png")):
+        folder = os.path.dirname(path or "") or "."
+        if path and not (path.endswith(ending) and os.path.isdir(folder) and os.access(folder, os.W_OK)):
+            raise LungMeshError(f"{option} {path} must be a {ending} file in a folder that can be written to.")
+    return Options(given.side, volume, size, given.airway, airway_size, given.bronchus_radius)
+
+
+def with_cells(cells, make):
+    """The Mesh of about so many tetrahedra; make: Mesh from a factor of the element sizes, which follows the count."""
+    factor = 1
+    for _ in range(6):
+        try:
+            mesh = make(factor)
+        except LungMeshError as error:
+            raise LungMeshError(f"--cells {cells} could not be reached: {error}") from error
+        if abs(len(mesh.tets) / cells - 1) <= 0.1:
+            return mesh
+        factor *= (len(mesh.tets) / cells) ** 0.4
+    raise LungMeshError(f"no element size gives about {cells} tetrahedra with this airway; try another --airway-size.")
+
+
+def resized(options, factor):
+    """The Options with all element sizes multiplied."""
+    size = options.size * factor
+    return replace(options, size=size, airway_size=min(options.airway_size, size))
+
+
+def adapted(options, path, cells):
+    """The Mesh whose sizes follow the run at path; cells: how many tetrahedra, or None for as many as there."""
+    field = read_size_field(path)
+    volume = np.abs(tet_volumes(field.points, field.tets)).sum() / 1e3
+    if abs(volume / options.volume - 1) > 0.01:
+        raise LungMeshError(f"--size-field {path} is of a lung of {volume:.0f} ml, not {options.volume:.0f} ml: give the "
+                            "options of the mesh that it ran on.")
+    cells = cells or len(field.tets)
+    sizes = field.sizes(cells)
+    return with_cells(cells, lambda factor: make_lungs(
+        replace(options, wanted=(field.points, field.tets, factor * sizes))))
+
+
+def mesh_of(given, options):
+    """The Mesh that the command line asks for."""
+    if given.size_field:
+        return adapted(options, given.size_field, given.cells)
+    if given.cells:
+        return with_cells(given.cells, lambda factor: make_lungs(resized(options, factor)))
+    return make_lungs(options)
+
+
+def main(arguments):
+    """Run the command line; returns the exit code."""
+    given = parse(arguments)
+    try:
+        options = filled_in(given)
+        mesh = mesh_of(given, options)
+        failures = print_report(mesh, measures(mesh))
+        if failures:
+            raise LungMeshError("; ".join(failures) + ", so no mesh was written.")
+        write_mesh(mesh, given.output, float(given.format), given.binary)
+        if given.picture:
+            picture(mesh, given.picture)
+    except LungMeshError as error:
+        print(f"lung_mesh: {error}", file=sys.stderr)
+        return 1
+    except MemoryError:
+        print("lung_mesh: the memory is used up: take fewer tetrahedra.", file=sys.stderr)
+        return 1
+    print(f"wrote {given.output}")
+    return 0

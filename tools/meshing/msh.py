@@ -1,0 +1,52 @@
+"""Writes a mesh as a MSH file."""
+import os
+
+import gmsh
+import numpy as np
+
+from .gmsh_model import gmsh_session
+from .mesh import LungMeshError
+
+
+def write_mesh(mesh, path, version=4.1, binary=False, digits=6):
+    """Write a mesh as MSH with physical names.
+
+    path: file to write. version: 4.1 or 2.2. binary: binary instead of ASCII.
+    digits: decimals kept of the coordinates (short ASCII files).
+    """
+    with gmsh_session():
+        first = {}
+        for (dimension, tag), name in mesh.names.items():
+            entity = gmsh.model.addDiscreteEntity(dimension, tag)
+            gmsh.model.addPhysicalGroup(dimension, [entity], tag)
+            gmsh.model.setPhysicalName(dimension, tag, name)
+            first[dimension] = min(first.get(dimension, tag), tag)
+        node_tags = np.arange(1, len(mesh.points) + 1)
+        gmsh.model.mesh.addNodes(3, first[3], node_tags, np.round(mesh.points, digits).ravel())
+        number = 1
+        for (dimension, tag) in mesh.names:
+            cells = mesh.facets[mesh.surfaces == tag] if dimension == 2 else mesh.tets[mesh.regions == tag]
+            gmsh.model.mesh.addElementsByType(
+                tag, {2: 2, 3: 4}[dimension], np.arange(number, number + len(cells)), cells.ravel() + 1)
+            number += len(cells)
+        gmsh.option.setNumber("Mesh.MshFileVersion", version)
+        gmsh.option.setNumber("Mesh.Binary", int(binary))
+        part = os.path.join(os.path.dirname(path), f"part_{os.getpid()}_{os.path.basename(path)}")
+        try:
+            gmsh.write(part)
+            if not is_whole(part):
+                raise LungMeshError(f"--output {path} cannot be written whole: free the disk, or choose another folder.")
+            os.replace(part, path)  # under its own name it is whole
+        finally:
+            if os.path.exists(part):
+                os.remove(part)
+
+
+def is_whole(path):
+    """Whether a MSH file has its end: gmsh says nothing of a full disk."""
+    try:
+        with open(path, "rb") as f:
+            f.seek(max(0, os.path.getsize(path) - 100))
+            return b"$EndElements" in f.read()
+    except OSError:
+        return False
