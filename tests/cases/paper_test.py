@@ -1,7 +1,5 @@
 #!/usr/bin/python3
 """tools/reproduce_paper: the quick plan from runs to page, resuming, stopped runs, and its own arithmetic."""
-import importlib.machinery
-import importlib.util
 import json
 import math
 import os
@@ -16,19 +14,12 @@ import numpy as np
 
 import pulmo_case as pulmo
 
+sys.dont_write_bytecode = True
+sys.path.insert(0, os.path.join(pulmo.SOURCE, "tools"))
+from paper import compartment, laws, sections  # noqa: E402
+
 TOOL = os.path.join(pulmo.SOURCE, "tools", "reproduce_paper")
 FIGURES = [f"figure{n}" for n in range(3, 10)]
-
-
-def load_tool():
-    """The script as a module (it has no .py ending)."""
-    sys.dont_write_bytecode = True
-    sys.path.insert(0, os.path.dirname(TOOL))  # as when it is called
-    loader = importlib.machinery.SourceFileLoader("reproduce_paper", TOOL)
-    module = importlib.util.module_from_spec(importlib.util.spec_from_loader("reproduce_paper", loader))
-    sys.modules["reproduce_paper"] = module
-    loader.exec_module(module)
-    return module
 
 
 def tool(*arguments, program=None):
@@ -117,17 +108,13 @@ class Outcomes(unittest.TestCase):
 class Arithmetic(unittest.TestCase):
     """Pieces of the tool against closed forms."""
 
-    @classmethod
-    def setUpClass(cls):
-        cls.tool = load_tool()
-
     def test_single_compartment_under_constant_pressure_and_ramp(self):
         C, R, P = 80.0, 0.0045, 6.0
         t = np.linspace(0, 2, 41)
-        volume, flow = self.tool.compartment(t, np.full(41, P), C, R)
+        volume, flow = compartment.compartment(t, np.full(41, P), C, R)
         np.testing.assert_allclose(volume, P * C * (1 - np.exp(-t / (R * C))), rtol=1e-12)
         np.testing.assert_allclose(flow, P / R * np.exp(-t / (R * C)), rtol=1e-10)
-        volume, _ = self.tool.compartment(t, P * t, C, R)
+        volume, _ = compartment.compartment(t, P * t, C, R)
         np.testing.assert_allclose(volume, P * C * (t - R * C * (1 - np.exp(-t / (R * C)))), rtol=1e-10, atol=1e-12)
 
     def test_section_of_a_box(self):
@@ -149,7 +136,7 @@ class Arithmetic(unittest.TestCase):
         nodes, cells = np.array(nodes), np.array(cells)
         field = 1 + 2 * nodes[:, 0] + 3 * nodes[:, 1] - nodes[:, 2]
         for height in (0.1, 0.37, 0.81):
-            corners, (values,) = self.tool.section(nodes, cells, field[None], height)
+            corners, (values,) = sections.section(nodes, cells, field[None], height)
             a, b, c = corners.reshape(-1, 3, 2).transpose(1, 0, 2)
             area = np.abs(np.cross(b - a, c - a)) / 2
             self.assertAlmostEqual(area.sum(), 1, places=12)
@@ -157,14 +144,14 @@ class Arithmetic(unittest.TestCase):
 
     def test_free_inflation_of_the_table(self):
         """dW/dJ of Table 1 at F = J^(1/3) I is 6 cmH2O at the J that the page uses."""
-        laws = {
+        energies = {
             "CM1": lambda s, J: 0.2808 / 2 * (3 * s - 3) + 0.4212 / 4 * (J * J - 1) - (0.2808 + 0.2106) * math.log(J - 0.01),
             "CM2": lambda s, J: 2 * math.exp(0.43 * (1.5 * s - 1.5) ** 2 - 0.6 * (0.75 * s * s - 1.5 * s + 0.75)),
             "CM3": lambda s, J: 0.3567 * (3 * s - 3) + 0.3567 / 1.075 * (J ** -2.15 - 1) + 5.766e-3 * (s - 1) ** 6,
             "CM4": lambda s, J: 1.298 * (3 * s - 3) + 1.298 / 0.75 * (J ** -1.5 - 1),
             "CM5": lambda s, J: 16.5 / 4 * (J * J - 1 - 2 * math.log(J))}
-        for label, W in laws.items():
-            J, h = self.tool.FREE_INFLATION[label], 1e-5
+        for label, W in energies.items():
+            J, h = laws.FREE_INFLATION[label], 1e-5
             slope = (W((J + h) ** (2 / 3), J + h) - W((J - h) ** (2 / 3), J - h)) / (2 * h)
             self.assertAlmostEqual(slope / pulmo.KPA_PER_CMH2O, 6, delta=0.003, msg=label)
 
