@@ -1,11 +1,11 @@
-"""Writes a mesh as a MSH file."""
+"""Writes meshes as MSH files and reads them."""
 import os
 
 import gmsh
 import numpy as np
 
-from .gmsh_model import gmsh_session
-from .mesh import LungMeshError
+from .gmsh_model import gmsh_elements, gmsh_nodes, gmsh_session
+from .mesh import LungMeshError, Mesh
 
 
 def write_mesh(mesh, path, version=4.1, binary=False, digits=6):
@@ -50,3 +50,20 @@ def is_whole(path):
             return b"$EndElements" in f.read()
     except OSError:
         return False
+
+
+def read_mesh(path):
+    """The Mesh of a file written by write_mesh."""
+    with gmsh_session():
+        gmsh.merge(path)
+        points, row = gmsh_nodes()
+        parts = {2: [], 3: []}
+        names = {}
+        for dimension, tag in gmsh.model.getPhysicalGroups():
+            names[dimension, tag] = gmsh.model.getPhysicalName(dimension, tag)
+            cells = [gmsh_elements(dimension, row, entity)
+                     for entity in gmsh.model.getEntitiesForPhysicalGroup(dimension, tag)]
+            parts[dimension].append((np.concatenate(cells), tag))
+    tags = {d: np.concatenate([np.full(len(cells), tag) for cells, tag in parts[d]]) for d in parts}
+    cells = {d: np.concatenate([cells for cells, _ in parts[d]]) for d in parts}
+    return Mesh(points, cells[3], tags[3], cells[2], tags[2], names)

@@ -1,40 +1,22 @@
-#!/usr/bin/python3
 """Make every mesh of the folder meshes/ and its README.md: cubes, column, hollow sphere and the lungs.
 
-    tools/test_meshes meshes
+    tools/make_meshes meshes
 
 Lengths are in mm. Runs on Debian's python3-gmsh, -numpy, -scipy, -skimage and -matplotlib.
 """
 import argparse
 import contextlib
-import importlib.machinery
-import importlib.util
 import io
 import os
 import sys
 
-import gmsh
 import numpy as np
 
-
-def load_tool(name):
-    """A script of this folder as a module (it has no .py ending)."""
-    path = os.path.join(os.path.dirname(os.path.abspath(__file__)), name)
-    loader = importlib.machinery.SourceFileLoader(name, path)
-    module = importlib.util.module_from_spec(importlib.util.spec_from_loader(name, loader))
-    sys.modules[name] = module
-    loader.exec_module(module)
-    return module
-
-
-sys.dont_write_bytecode = True
-sm = load_tool("sphere_mesh")
-from meshing import lung_command  # noqa: E402
-from meshing.geometry import boundary_facets, orient  # noqa: E402
-from meshing.gmsh_model import gmsh_elements, gmsh_nodes, gmsh_session  # noqa: E402
-from meshing.mesh import Mesh  # noqa: E402
-from meshing.msh import write_mesh  # noqa: E402
-from meshing.report import measures  # noqa: E402
+from . import lung_command
+from .boxes import box, box_face, irregular_cube, refined, tagged, x1_or_rest
+from .msh import read_mesh, write_mesh
+from .report import measures
+from .sphere import shell
 
 CUBE_FACES = ["x0", "x1", "y0", "y1", "z0", "z1"]
 LUNGS = {
@@ -58,7 +40,7 @@ ABOUT = {
 }
 README = """# Meshes
 
-All made by `tools/test_meshes meshes`, which writes this file too. The lungs can be made one by one with the
+All made by `tools/make_meshes meshes`, which writes this file too. The lungs can be made one by one with the
 commands shown; `tools/lung_mesh --help` tells how to make others. MSH 4.1 ASCII unless the name says otherwise,
 lengths in mm, lung axes RAS (x to the subject's right, y to the front, z up).
 
@@ -82,83 +64,6 @@ not from a patient. Surface area over volume^(2/3) of the pair is {pair_shape:.2
 """
 
 
-def current_mesh():
-    """Points and positively oriented tetrahedra of the current gmsh model."""
-    points, row = gmsh_nodes()
-    tets = gmsh_elements(3, row)
-    used, tets = np.unique(tets, return_inverse=True)
-    points, tets = points[used], tets.reshape(-1, 4)
-    return points, orient(points, tets)
-
-
-def tagged(points, tets, classify, surface_names, volume_name):
-    """A one-volume mesh whose boundary triangles are named by their centres.
-
-    classify: function from centres (b, 3) to an index into surface_names.
-    """
-    facets = boundary_facets(tets)
-    surfaces = 1 + classify(points[facets].mean(axis=1))
-    names = {(2, i + 1): name for i, name in enumerate(surface_names)}
-    volume = len(surface_names) + 1
-    names[3, volume] = volume_name
-    return Mesh(points, tets, np.full(len(tets), volume), facets, surfaces, names)
-
-
-def box(lengths, size):
-    """Points and tetrahedra of the box [0, lengths] meshed by gmsh with one element size."""
-    with gmsh_session():
-        gmsh.model.occ.addBox(0, 0, 0, *lengths)
-        gmsh.model.occ.synchronize()
-        gmsh.option.setNumber("Mesh.MeshSizeMin", size)
-        gmsh.option.setNumber("Mesh.MeshSizeMax", size)
-        gmsh.model.mesh.generate(3)
-        gmsh.model.mesh.optimize("")
-        return current_mesh()
-
-
-def box_face(lengths):
-    """A classifier of facet centres of the box [0, lengths]: 0 to 5 for x0 x1 y0 y1 z0 z1."""
-    def classify(centres):
-        distance = np.stack([centres, np.asarray(lengths) - centres], axis=2).reshape(len(centres), 6)
-        return np.argmin(distance, axis=1)
-    return classify
-
-
-def x1_or_rest(lengths):
-    """A classifier of facet centres of the box [0, lengths]: 0 for the face x1, 1 for the others."""
-    return lambda centres: (box_face(lengths)(centres) != 1).astype(int)
-
-
-def irregular_cube():
-    """The unit cube of 24 tetrahedra, its face centres moved so that no symmetry is left.
-
-    Solutions on a symmetric mesh can converge faster than they should.
-    """
-    points, tets = box((1, 1, 1), 1)
-    shift = 0.12 * np.sin(np.arange(1, 3 * len(points) + 1) * 12.9898).reshape(-1, 3)
-    on_face = np.isclose(points, 0) | np.isclose(points, 1)
-    return np.where(on_face, points, points + shift), tets
-
-
-def refined(points, tets):
-    """Each tetrahedron cut in eight through its edge middles, along the shortest inner diagonal."""
-    pairs = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
-    edges, number = np.unique(np.sort(tets[:, pairs], axis=2).reshape(-1, 2), axis=0, return_inverse=True)
-    middle = len(points) + number.reshape(-1, 6)
-    points = np.vstack([points, points[edges].mean(axis=1)])
-    nodes = np.hstack([tets, middle])
-    corners = nodes[:, [[0, 4, 5, 6], [4, 1, 7, 8], [5, 7, 2, 9], [6, 8, 9, 3]]].reshape(-1, 4)
-    inner = []
-    rings = {(4, 9): [5, 6, 8, 7], (5, 8): [4, 6, 9, 7], (6, 7): [4, 5, 9, 8]}
-    lengths = np.stack([np.linalg.norm(points[nodes[:, a]] - points[nodes[:, b]], axis=1) for a, b in rings])
-    shortest = np.argmin(lengths, axis=0)
-    for choice, ((a, b), ring) in enumerate(rings.items()):
-        quarters = [[a, b, ring[i], ring[(i + 1) % 4]] for i in range(4)]
-        inner.append(nodes[shortest == choice][:, quarters].reshape(-1, 4))
-    tets = np.vstack([corners, *inner])
-    return points, orient(points, tets)
-
-
 def simple_meshes():
     """The meshes that are not lungs: {file name: (Mesh, MSH version, binary)}."""
     unit = (1, 1, 1)
@@ -175,7 +80,7 @@ def simple_meshes():
         "cube_lung.msh": tagged(*box((10, 10, 10), 5), x1_or_rest((10, 10, 10)), ["airway", "pleura"], "lung"),
         "column.msh": tagged(*box(column_lengths, 0.045), lambda c: column_side[box_face(column_lengths)(c)],
                              ["x0", "x1", "sides_y", "sides_z"], "body"),
-        "hollow_sphere.msh": tagged(*sm.shell(SPHERE["divisions"], SPHERE["layers"], 7.5, 72.5)[:2],
+        "hollow_sphere.msh": tagged(*shell(SPHERE["divisions"], SPHERE["layers"], 7.5, 72.5)[:2],
                                     lambda c: (np.linalg.norm(c, axis=1) > 40).astype(int),
                                     ["airway", "pleura"], "lung"),
     }
@@ -185,23 +90,6 @@ def simple_meshes():
             name = f"cube_msh{round(10 * version)}_{'binary' if binary else 'ascii'}.msh"
             files[name] = (tiny, version, binary)
     return files
-
-
-def from_file(path):
-    """The Mesh of a file written by lung_mesh."""
-    with gmsh_session():
-        gmsh.merge(path)
-        points, row = gmsh_nodes()
-        parts = {2: [], 3: []}
-        names = {}
-        for dimension, tag in gmsh.model.getPhysicalGroups():
-            names[dimension, tag] = gmsh.model.getPhysicalName(dimension, tag)
-            cells = [gmsh_elements(dimension, row, entity)
-                     for entity in gmsh.model.getEntitiesForPhysicalGroup(dimension, tag)]
-            parts[dimension].append((np.concatenate(cells), tag))
-    tags = {d: np.concatenate([np.full(len(cells), tag) for cells, tag in parts[d]]) for d in parts}
-    cells = {d: np.concatenate([cells for cells, _ in parts[d]]) for d in parts}
-    return Mesh(points, cells[3], tags[3], cells[2], tags[2], names)
 
 
 def row(name, mesh, command):
@@ -217,11 +105,11 @@ def row(name, mesh, command):
 
 def main(arguments):
     """Run the command line; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="test_meshes", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(prog="make_meshes", description=__doc__.splitlines()[0])
     parser.add_argument("folder", help="where to write the meshes and README.md")
     folder = parser.parse_args(arguments).folder
     if not os.path.isdir(folder):
-        sys.exit(f"test_meshes: {folder} is not a folder.")
+        sys.exit(f"make_meshes: {folder} is not a folder.")
     meshes = {}
     commands = {}
     for name, options in LUNGS.items():
@@ -229,12 +117,12 @@ def main(arguments):
             code = lung_command.main(options.split() + ["--output", os.path.join(folder, name)])
         if code:
             return code
-        meshes[name] = from_file(os.path.join(folder, name))
+        meshes[name] = read_mesh(os.path.join(folder, name))
         commands[name] = f"tools/lung_mesh {options} --output meshes/{name}"
     for name, (mesh, version, binary) in simple_meshes().items():
         write_mesh(mesh, os.path.join(folder, name), version, binary, digits=9)
         meshes[name] = mesh
-        commands[name] = "tools/test_meshes meshes"
+        commands[name] = "tools/make_meshes meshes"
     write_readme(os.path.join(folder, "README.md"), meshes, commands)
     return 0
 
@@ -250,7 +138,3 @@ def write_readme(path, meshes, commands):
     pair_shape = measures(meshes["lung_pair.msh"])["shape"]
     with open(path, "w", encoding="utf-8") as file:
         file.write(README.format(table="\n".join(table), sphere=errors, pair_shape=pair_shape, **SPHERE))
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
