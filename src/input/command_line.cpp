@@ -102,7 +102,9 @@ public:
       if (is_one_of(word.text, {"--help", "-h", "-?"}))
         word.text = "-help";
       else if (is_one_of(word.text, {"-version", "--version"}))
-        given_.version = true;
+        given_.question = "version";
+      else if (is_one_of(word.text, {"-list", "--list"}))
+        given_.question = "list";
     return sequence(words, "command line", "on the command line");
   }
 
@@ -333,7 +335,7 @@ std::string GivenOptions::packed() const
   std::string text;
   const auto add = [&](const std::string &s) { text += s + '\0'; };
   add(fault);
-  add(version ? "1" : "");
+  add(question);
   add(std::to_string(unasked.size()));
   for (const std::string &s : unasked) add(s);
   for (const GivenOption &o : list) {
@@ -355,7 +357,7 @@ GivenOptions GivenOptions::unpacked(const std::string &text)
     return s;
   };
   given.fault = next();
-  given.version = !next().empty();
+  given.question = next();
   for (auto n = std::stoul(next()); n > 0; --n) given.unasked.push_back(next());
   while (at < text.size()) {
     GivenOption o;

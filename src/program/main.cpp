@@ -74,6 +74,23 @@ int exit_code(PetscErrorCode code, bool finished)
   }
 }
 
+/// What can be chosen: one line for each law and effect, what it is and its names first.
+void print_list(const pulmo::Registry &registry)
+{
+  const auto print = [](const char *kind, const std::string &names, const char *about) {
+    std::printf("%-12s %-16s %s\n", kind, names.c_str(), about);
+  };
+
+  for (const auto &law : registry.make_tissue_laws()) {
+    const std::string alias = law->alias();
+    print("tissue", law->name() + (alias.empty() ? "" : "|" + alias), law->source());
+  }
+  for (const auto &law : registry.make_permeability_laws())
+    print("permeability", law->name(), "how permeability follows deformation");
+  const pulmo::Scene scene(registry);
+  for (const auto &effect : scene.effects()) print("effect", effect->name(), effect->about());
+}
+
 /// Makes what rank 0 has known to all ranks.
 void share(std::string &text)
 {
@@ -137,14 +154,16 @@ int main(int argc, char **argv)
   if (rank == 0) packed = pulmo::read_options({argv + 1, argv + argc}, pulmo::Surroundings::of_process()).packed();
   share(packed);
   const pulmo::GivenOptions given = pulmo::GivenOptions::unpacked(packed);
-  if (given.version || !given.fault.empty()) {
-    if (rank == 0 && given.version)
+  if (!given.question.empty() || !given.fault.empty()) {
+    if (rank == 0 && given.question == "version")
       std::printf("pulmo %s (PETSc %d.%d.%d)\n", pulmo::version(), PETSC_VERSION_MAJOR, PETSC_VERSION_MINOR,
                   PETSC_VERSION_SUBMINOR);
+    else if (rank == 0 && given.question == "list")
+      print_list(pulmo::Registry::standard());
     else if (rank == 0)
       std::fprintf(stderr, "pulmo: error: %s\n", given.fault.c_str());
     MPI_Finalize();
-    return given.version ? PULMO_FINISHED : PULMO_WRONG_INPUT;
+    return given.question.empty() ? PULMO_WRONG_INPUT : PULMO_FINISHED;
   }
   pulmo::OptionList sources;
   PetscErrorCode code = hand_over(given, sources);

@@ -306,6 +306,19 @@ class Sources(unittest.TestCase):
             case = pulmo.Case([flag], directory="-", cwd=self.work)
             self.assertEqual(case.code, 0, case.tail())
             self.assertIn("-ventilator_pip ", case.out)
+        for flag in "-list", "--list":  # what -help describes at length, in the same order
+            listed = pulmo.Case([flag], directory="-", cwd=self.work, ranks=2 if flag == "-list" else 1)
+            self.assertEqual(listed.code, 0, listed.tail())
+            of = {}
+            for line in listed.out.splitlines():
+                kind, names, about = line.split(maxsplit=2)
+                of.setdefault(kind, {})[names] = about
+            self.assertEqual(list(of), ["tissue", "permeability", "effect"])
+            self.assertIn(f"tissue law [one of {'|'.join(of['tissue'])}]", case.out)
+            self.assertIn(f"[one of {'|'.join(of['permeability'])}]", case.out)
+            for about in of["effect"].values():
+                self.assertIn(f"\n{about}\n", case.out)
+            self.assertEqual([n for n in of["effect"] if f"\n  -{n} " not in case.out], [])
         self.assertNotIn("results", os.listdir(self.work))
 
 

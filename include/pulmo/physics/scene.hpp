@@ -31,7 +31,9 @@ public:
   const std::optional<Openings> &openings() const { return openings_; }
   const Tissue &tissue() const { return *tissue_; }
   const Airflow &airflow() const { return *airflow_; }
-  /// Active effects in order of registration.
+  /// All effects that a scene may ask for, in order of registration.
+  const std::vector<std::unique_ptr<Effect>> &effects() const { return effects_; }
+  /// Those that this one asks for, in the same order.
   std::vector<const Effect *> active() const;
 
 private:
