@@ -53,9 +53,8 @@ struct Case {
 std::vector<Case> cases()
 {
   std::vector<Case> list;
-  for (const char *law : {"berger", "ma", "birzle", "yoshihara", "rausch"})
-    list.push_back(
-        {std::string("airflow, springs, ") + law, breath + gas + springs + "-lumen_pressure -tissue " + law + " "});
+  for (const std::string &law : law_names())
+    list.push_back({"airflow, springs, " + law, breath + gas + springs + "-lumen_pressure -tissue " + law + " "});
   list.push_back({"paper's traction", breath + gas + springs});
   list.push_back(
       {"normal springs", breath + gas + springs + "-chest_wall_direction normal -chest_wall_surfaces pleura "});

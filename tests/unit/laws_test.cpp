@@ -1,4 +1,4 @@
-// The five tissue laws through the interface TissueLaw, against differences, symmetries and closed forms.
+// Every tissue law through the interface TissueLaw, against differences, symmetries and closed forms.
 #include "pulmo/physics/registry.hpp"
 #include "unit/tensors.hpp"
 
@@ -56,7 +56,7 @@ void over_states(Check check)
 
 constexpr double h = 2e-4;
 
-TEST(Laws, AreTheFiveOfThePaper)
+TEST(Laws, ThoseOfThePaperAreThere)
 {
   const auto laws = five_laws();
   const char *names[] = {"berger", "ma", "birzle", "yoshihara", "rausch"};
@@ -205,26 +205,32 @@ TEST(Laws, StressNearTheReferenceStateIsLinearElasticity)
 
 TEST(Laws, FreeInflationFollowsTheClosedForms)
 {
-  const auto laws = five_laws();
-  for (int law = 1; law <= 5; ++law)
-    for (double J : {0.3, 0.7, 0.99, 1.0, 1.01, 1.5, 2.5, 4.0}) {
-      const double s = std::cbrt(J), p = inflation_pressure(law, J);
-      const Tensor P = stress(*laws[law - 1], s * identity);
-      EXPECT_LT(largest(P - (s * s * p) * identity), 1e-13 * (1 + std::abs(p))) << "CM" << law << " J = " << J;
+  std::string without;
+  for (const auto &law : Registry::standard().make_tissue_laws()) {
+    if (!inflation_pressure(law->name(), 1)) {
+      without += std::string(" ") + law->name();
+      continue;
     }
+    for (double J : {0.3, 0.7, 0.99, 1.0, 1.01, 1.5, 2.5, 4.0}) {
+      const double s = std::cbrt(J), p = *inflation_pressure(law->name(), J);
+      const Tensor P = stress(*law, s * identity);
+      EXPECT_LT(largest(P - (s * s * p) * identity), 1e-13 * (1 + std::abs(p))) << law->name() << " J = " << J;
+    }
+  }
+  if (!without.empty()) GTEST_SKIP() << "tests/unit/tensors.hpp has no closed form of" << without;
 }
 
 TEST(Laws, InflatedVolumesAtSixCentimetresOfWater)
 {
   const double J[] = {2.7032, 1.7671, 4.2169, 1.1325, 1.0363}, p = 6 * units::kPa_per_cmH2O;
   const auto laws = five_laws();
-  for (int law = 1; law <= 5; ++law) {
-    EXPECT_NEAR(inflation_J(law, p), J[law - 1], 5.1e-5) << "CM" << law;
+  for (int i = 0; i < 5; ++i) {
+    const TissueLaw &law = *laws[i];
+    EXPECT_NEAR(inflation_J(law, p), J[i], 5.1e-5) << law.name();
     // and from the law's own stress
-    const double own =
-        root([&](double x) { return stress(*laws[law - 1], std::cbrt(x) * identity)[0] / std::pow(x, 2. / 3) - p; },
-             0.9, law == 4 ? 2.5 : 6);
-    EXPECT_NEAR(own, inflation_J(law, p), 1e-12) << "CM" << law;
+    const double own = root([&](double x) { return stress(law, std::cbrt(x) * identity)[0] / std::pow(x, 2. / 3) - p; },
+                            0.9, i == 3 ? 2.5 : 6);
+    EXPECT_NEAR(own, inflation_J(law, p), 1e-12) << law.name();
   }
 }
 

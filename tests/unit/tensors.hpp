@@ -10,6 +10,8 @@
 #include <array>
 #include <cmath>
 #include <functional>
+#include <memory>
+#include <optional>
 #include <random>
 #include <string>
 #include <vector>
@@ -149,39 +151,46 @@ inline double derivative(const std::function<double(double)> &f, double h)
   return (8 * (f(h) - f(-h)) - (f(2 * h) - f(-2 * h))) / (12 * h);
 }
 
-/// All five laws with the parameters of the paper, in the order CM1 ... CM5.
-inline std::vector<std::unique_ptr<TissueLaw>> five_laws()
+/// Names of the tissue laws that pulmo offers, the default first.
+inline std::vector<std::string> law_names()
 {
-  auto laws = Registry::standard().make_tissue_laws();
-  std::sort(laws.begin(), laws.end(),
-            [](const auto &a, const auto &b) { return std::string(a->alias()) < b->alias(); });
-  return laws;
+  std::vector<std::string> names;
+  for (const auto &law : Registry::standard().make_tissue_laws()) names.emplace_back(law->name());
+  return names;
 }
 
-/// Free inflation, F = J^1/3 I: p = dW/dJ (kPa) of CM1 ... CM5 (law = 1 ... 5) with the paper's parameters.
-inline double inflation_pressure(int law, double J)
+/// The five laws of the paper with its parameters, CM1 ... CM5. pulmo may offer more.
+inline std::vector<std::unique_ptr<TissueLaw>> five_laws()
+{
+  std::vector<std::unique_ptr<TissueLaw>> five;
+  for (int i = 1; i <= 5; ++i)
+    for (auto &law : Registry::standard().make_tissue_laws())
+      if (law->alias() == "cm" + std::to_string(i)) five.push_back(std::move(law));
+  return five;
+}
+
+/// Free inflation, F = J^1/3 I: p = dW/dJ (kPa) of a law with the paper's parameters in closed form, if there is one.
+inline std::optional<double> inflation_pressure(const std::string &law, double J)
 {
   const double s = std::pow(J, 2. / 3), t = std::pow(J, -1. / 3);
-  switch (law) {
-  case 1: {
+  if (law == "berger") {
     const double mu = 0.2808, lambda = 0.4212, phi0 = 0.99;
     return mu * t + lambda / 2 * J - (mu + lambda / 2) / (J - 1 + phi0);
   }
-  case 2: {
+  if (law == "ma") {
     const double a = 0.43, b = -0.6, c = 2, g = 3 * (3 * a + b) / 4;
     return c * std::exp(g * (s - 1) * (s - 1)) * 2 * g * (s - 1) * 2 / 3 * t;
   }
-  case 3: {
+  if (law == "birzle") {
     const double c = 0.3567, beta = 1.075, c3 = 5.766e-3;
     return 2 * c * t - 2 * c * std::pow(J, -2 * beta - 1) + 4 * c3 * std::pow(s - 1, 5) * t;
   }
-  case 4: {
+  if (law == "yoshihara") {
     const double c = 1.298, beta = 0.75;
     return 2 * c * t - 2 * c * std::pow(J, -2 * beta - 1);
   }
-  default:
-    return 16.5 / 2 * (J - 1 / J);
-  }
+  if (law == "rausch") return 16.5 / 2 * (J - 1 / J);
+  return {};
 }
 
 /// Root of an increasing function between @p low and @p high.
@@ -194,10 +203,19 @@ inline double root(const std::function<double(double)> &f, double low, double hi
   return (low + high) / 2;
 }
 
-/// J of free inflation at pressure @p p (kPa), on the branch that starts at J = 1.
-inline double inflation_J(int law, double p)
+/// J of free inflation at pressure @p p (kPa), on the branch that starts at J = 1. Of a law without a closed form it is
+/// that of its own stress.
+inline double inflation_J(const TissueLaw &law, double p)
 {
-  return root([&](double J) { return inflation_pressure(law, J) - p; }, 0.9, law == 4 ? 2.5 : 6);
+  const auto excess = [&](double J) {
+    const auto closed = inflation_pressure(law.name(), J);
+    Tensor P;
+    law.stress(state_of_F(std::cbrt(J) * identity), P.data());
+    return (closed ? *closed : P[0] / std::pow(J, 2. / 3)) - p;
+  };
+  double low = 0.9;
+  while (excess(low + 0.1) < 0 && low < 10) low += 0.1;
+  return root(excess, low, low + 0.1);
 }
 
 } // namespace pulmo::test

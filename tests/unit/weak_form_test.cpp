@@ -291,7 +291,7 @@ TEST(WeakForm, EveryColumnOfTheJacobianForEveryCombinationOfEffects)
 TEST(WeakForm, EveryColumnOfTheJacobianForEveryLawAndAnyShift)
 {
   unsigned seed = 300;
-  for (const char *law : {"berger", "ma", "birzle", "yoshihara", "rausch"})
+  for (const std::string &law : law_names())
     for (bool airflow : {false, true}) {
       const SceneSpec scene = full_scene(airflow, law);
       SCOPED_TRACE(scene.text());
@@ -500,7 +500,7 @@ TEST(Integration, AgreesWithPetscForEveryCombinationOfEffects)
 
 TEST(Integration, AgreesWithPetscForEveryLaw)
 {
-  for (const char *law : {"berger", "ma", "birzle", "yoshihara", "rausch"})
+  for (const std::string &law : law_names())
     for (bool airflow : {false, true}) expect_same_integration(full_scene(airflow, law), 40, 1e-12);
 }
 

@@ -8,6 +8,7 @@
 
 #include <complex>
 #include <cstring>
+#include <optional>
 
 using namespace pulmo;
 using namespace pulmo::test;
@@ -18,7 +19,7 @@ using Complex = std::complex<double>;
 
 /// W of a law in uniaxial strain, where I1 = J^2 + 2, I2 = 2 J^2 + 1, I3 = J^2: from the published formulas (Table 1 of
 /// Aviles-Rojas & Hurtado 2022; c/beta in Birzle's), not from pulmo's.
-Complex uniaxial_energy(const std::string &law, Complex J)
+std::optional<Complex> uniaxial_energy(const std::string &law, Complex J)
 {
   const Complex I1 = J * J + 2.0, I2 = 2.0 * J * J + 1.0, I3 = J * J;
   if (law == "berger")
@@ -33,15 +34,18 @@ Complex uniaxial_energy(const std::string &law, Complex J)
            5.766e-3 * bulk * bulk * bulk * bulk * bulk * bulk;
   }
   if (law == "yoshihara") return 1.298 * (I1 - 3.0) + 1.298 / 0.75 * (std::pow(I3, -0.75) - 1.0);
-  const Complex shear = I1 * std::pow(I3, -1.0 / 3) - 3.0; // rausch
-  return 4.1 * shear * shear + 20.7 * shear * shear * shear + 16.5 / 4 * (I3 - 1.0 - 2.0 * std::log(J));
+  if (law == "rausch") {
+    const Complex shear = I1 * std::pow(I3, -1.0 / 3) - 3.0;
+    return 4.1 * shear * shear + 20.7 * shear * shear * shear + 16.5 / 4 * (I3 - 1.0 - 2.0 * std::log(J));
+  }
+  return {};
 }
 
 /// P(J) = W', by a complex step: no difference, no cancellation.
 double uniaxial_stress(const std::string &law, double J)
 {
   constexpr double h = 1e-30;
-  return uniaxial_energy(law, {J, h}).imag() / h;
+  return uniaxial_energy(law, {J, h}).value().imag() / h;
 }
 
 /// J with P(J) = stress, by bisection between J where the laws are stable.
@@ -190,19 +194,22 @@ std::array<double, 3> integral_over_plane(DM dm, Vec local, int d, double value)
   return sum;
 }
 
-const char *const laws[] = {"berger", "ma", "birzle", "yoshihara", "rausch"};
-
 } // namespace
 
 TEST(Gravity, ColumnUnderItsOwnWeightForEveryLaw)
 {
-  for (const char *law : laws)
+  std::string without;
+  for (const std::string &law : law_names()) {
+    if (!uniaxial_energy(law, 1)) {
+      without += " " + law;
+      continue;
+    }
     for (const double g : {900.0, -500.0}) { // stands, hangs
       // at the free end CM5 has no shear stiffness (its modulus at F = I is zero), and tension gives it none
-      if (std::strcmp(law, "rausch") == 0 && g < 0) continue;
-      SCOPED_TRACE(std::string(law) + (g > 0 ? " stands" : " hangs"));
+      if (law == "rausch" && g < 0) continue;
+      SCOPED_TRACE(law + (g > 0 ? " stands" : " hangs"));
       Solved s;
-      PULMO_OK(s.go(column_options(std::string("-tissue ") + law +
+      PULMO_OK(s.go(column_options("-tissue " + law +
                                    " -gravity -gravity_tissue_density 1000 -gravity_air_density 100 "
                                    "-tissue_porosity 0.7 -gravity_direction " +
                                    (g > 0 ? "-2,0,0" : "0.5,0,0") + " -gravity_acceleration " +
@@ -223,12 +230,14 @@ TEST(Gravity, ColumnUnderItsOwnWeightForEveryLaw)
       const double base = -s.forces.sum()[0] / 0.01;
       (void)PetscPrintf(PETSC_COMM_WORLD,
                         "  %-9s g %5.0f: J at the base %.4f  u(L) %9.6f  errors u %.1e J %.1e  base %.9f (%.9f) kPa\n",
-                        law, g, exact.J[0], exact.u[Column::n], u_error, J_error, base, exact.base_stress);
+                        law.c_str(), g, exact.J[0], exact.u[Column::n], u_error, J_error, base, exact.base_stress);
       EXPECT_GT(std::abs(exact.J[0] - J_of_stress(law, 0)), 0.005);
       EXPECT_LT(u_error, 2e-4 * u_size);
       EXPECT_LT(J_error, 5e-3 * std::abs(exact.J[0] - 1));
       EXPECT_NEAR(base, exact.base_stress, 1e-5 * std::abs(exact.base_stress));
     }
+  }
+  if (!without.empty()) GTEST_SKIP() << "uniaxial_energy has no published formula of" << without;
 }
 
 TEST(Gravity, GasAtRestIsHydrostaticAndTheTissueCarriesTheRest)
