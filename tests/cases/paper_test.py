@@ -28,10 +28,12 @@ def tool(*arguments, program=None):
 
 
 def fake_program(body):
-    """A program that does `body` (Python) in its -output_dir, called `out`."""
+    """A program that does `body` (Python) in its -output_dir, called `out`, and lists one law."""
     path = pulmo.scratch("fake")
     with open(path, "w") as f:
-        f.write("#!/usr/bin/python3\nimport os, sys\nout = sys.argv[sys.argv.index('-output_dir') + 1]\n" + body)
+        f.write("#!/usr/bin/python3\nimport os, sys\n"
+                "if '-list' in sys.argv: sys.exit(print('tissue mine by me'))\n"
+                "out = sys.argv[sys.argv.index('-output_dir') + 1]\n" + body)
     os.chmod(path, os.stat(path).st_mode | stat.S_IXUSR)
     return path
 
@@ -86,6 +88,7 @@ class Outcomes(unittest.TestCase):
         done = tool("--quick", "--runs", pulmo.scratch(), "--only", "table3", program=program)
         self.assertEqual(done.returncode, 0, done.stdout + done.stderr)
         self.assertIn("ks0_birzle stopped: steps only crawl.", done.stdout)
+        self.assertIn("not of the paper and left out: mine\n", done.stdout)
 
     def test_a_run_that_goes_wrong_is_an_error(self):
         done = tool("--quick", "--runs", pulmo.scratch(), "--only", "figure4", program=fake_program("sys.exit('no licence')\n"))

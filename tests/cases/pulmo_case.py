@@ -18,14 +18,15 @@ import h5py
 import numpy as np
 
 SOURCE = os.environ.get("PULMO_SOURCE_DIR", os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))))
+sys.path.insert(0, os.path.join(SOURCE, "tools"))
+from benchmarks import common  # noqa: E402
+from benchmarks.common import KPA_PER_CMH2O  # noqa: E402, F401: of the tests
+
 PROGRAM, LAUNCHER = None, ["mpiexec", "--oversubscribe", "-n"]
-KPA_PER_CMH2O = 0.0980665
 _scratch = tempfile.TemporaryDirectory(prefix="pulmo_case_")
 
-ENVIRONMENT = dict(os.environ, OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1", OMPI_ALLOW_RUN_AS_ROOT="1",
-                   OMPI_ALLOW_RUN_AS_ROOT_CONFIRM="1",
-                   # several tests share the cores
-                   OMPI_MCA_hwloc_base_binding_policy="none", OMPI_MCA_mpi_yield_when_idle="1")
+# several tests share the cores
+ENVIRONMENT = common.environment() | {"OMPI_MCA_hwloc_base_binding_policy": "none", "OMPI_MCA_mpi_yield_when_idle": "1"}
 
 
 def mesh(name):
@@ -76,25 +77,25 @@ def replay(rows):
                              for dt, p in zip(rows["dt_s"][1:], rows["airway_pressure_cmH2O"][1:])))
 
 
+def tissue_laws():
+    """Names of the tissue laws that the program offers, CM1 to CM5 first."""
+    return common.tissue_laws(PROGRAM)
+
+
+# p = dW/dJ (kPa) of F = J^(1/3) I for J, s = J^(2/3) and t = J^(-1/3), with the parameters of Table 1 (not pulmo's code)
+CLOSED_FORMS = {
+    "berger": lambda J, s, t: 0.2808 * t + 0.4212 / 2 * J - (0.2808 + 0.4212 / 2) / (J - 1 + 0.99),
+    "ma": lambda J, s, t: 2 * np.exp(G_MA * (s - 1) ** 2) * 2 * G_MA * (s - 1) * 2 / 3 * t,
+    "birzle": lambda J, s, t: 2 * 0.3567 * (t - J ** (-2 * 1.075 - 1)) + 4 * 5.766e-3 * (s - 1) ** 5 * t,
+    "yoshihara": lambda J, s, t: 2 * 1.298 * (t - J ** (-2 * 0.75 - 1)),
+    "rausch": lambda J, s, t: 16.5 / 2 * (J - 1 / J),
+}
+G_MA = 3 * (3 * 0.43 - 0.6) / 4
+
+
 def gas_pressure(law, J):
-    """p = dW/dJ of F = J^(1/3) I, cmH2O, with the parameters of Table 1 (closed forms, not pulmo's code)."""
-    s, J3 = np.cbrt(J) ** 2, 1 / np.cbrt(J)
-    if law == "berger":
-        mu, lam, phi0 = 0.2808, 0.4212, 0.99
-        p = mu * J3 + lam / 2 * J - (mu + lam / 2) / (J - 1 + phi0)
-    elif law == "ma":
-        a, b, c = 0.43, -0.6, 2
-        g = 3 * (3 * a + b) / 4
-        p = c * np.exp(g * (s - 1) ** 2) * 2 * g * (s - 1) * 2 / 3 * J3
-    elif law == "birzle":
-        c, beta, c3 = 0.3567, 1.075, 5.766e-3
-        p = 2 * c * J3 - 2 * c * J ** (-2 * beta - 1) + 4 * c3 * (s - 1) ** 5 * J3
-    elif law == "yoshihara":
-        c, beta = 1.298, 0.75
-        p = 2 * c * J3 - 2 * c * J ** (-2 * beta - 1)
-    elif law == "rausch":
-        p = 16.5 / 2 * (J - 1 / J)
-    return p / KPA_PER_CMH2O
+    """p = dW/dJ of F = J^(1/3) I, cmH2O, of a law with a closed form."""
+    return CLOSED_FORMS[law](J, np.cbrt(J) ** 2, 1 / np.cbrt(J)) / KPA_PER_CMH2O
 
 
 class Case:

@@ -214,7 +214,7 @@ class Tools(unittest.TestCase):
     def test_benchmark_compares_integrators(self):
         """Both integrators give the same residual and Jacobian; only then are times worth comparing."""
         program = os.path.join(os.path.dirname(pulmo.PROGRAM), "pulmo_assembly_benchmark")
-        for law in ("berger", "ma", "birzle", "yoshihara", "rausch"):
+        for law in pulmo.tissue_laws():
             with self.subTest(law=law):
                 run = subprocess.run([program] + pulmo.DIRECT + pulmo.PCV + pulmo.CUBE +
                                      ["-tissue", law, "-lumen_pressure", "-benchmark_repeats", "1"], env=pulmo.ENVIRONMENT,

@@ -1,11 +1,10 @@
-"""Which elements: what P2-P1, P1-P1 and P3-P2 cost for the same error in space, for the five laws on the built-in right lung."""
+"""Which elements: what P2-P1, P1-P1 and P3-P2 cost for the same error in space, for every tissue law on the built-in right lung."""
 import statistics
 
 from benchmarks.common import markdown, write_csv
 from benchmarks.plots import plt, save
 
 from . import command, laws, page
-from .laws import LAWS
 from .numbers import KEYS, short
 from .pictures import fill, logarithmic
 from .settings import ELEMENTS
@@ -19,9 +18,9 @@ WANTED = (0.05, 0.02)
 def search_of(law, paths, results, build):
     """The ladder in space of one law with each pair of elements; one step in time."""
     search = command.prepare(["pcv", "paper", "--meshes", *map(str, paths), "--elements", *ELEMENTS, "--dt", "0.1", "--dt-factors", "1", "--schemes", "beuler",
-                              "--adaptive", "0", "--tolerances", "--solvers", laws.SOLVER.get(law, "iterative"), "--clock", "cpu",
-                              "--budget", BUDGET, "--output", str(results / law), "--results", str(results), *build,
-                              "--", "-ventilator_ramp_down", "0.1", "-tissue", law, *LAWS[law][2]])
+                              "--adaptive", "0", "--tolerances", "--solvers", law.solver(), "--clock", "cpu",
+                              "--budget", BUDGET, "--output", str(results / law.name), "--results", str(results), *build,
+                              "--", "-ventilator_ramp_down", "0.1", *law.words()])
     if search.ladder.attempt(search.axes.base):
         search.singles(search.ladder.budget)
     return search
@@ -47,14 +46,14 @@ def runs_by_mesh(search):
 
 def rows(searches):
     """One for each law, mesh and pair: cells, dofs, CPU s, errors of the numbers in %, None where there is none."""
-    return [[LAWS[law][0], mesh.elements, mesh.cells, run.summary["dofs"], run.cpu, run.summary["rejected_steps"],
+    return [[law.label, mesh.elements, mesh.cells, run.summary["dofs"], run.cpu, run.summary["rejected_steps"],
              *(100 * errors[mesh] if mesh in (errors := in_space(search, key)) else None for key in KEYS)]
             for law, search in searches.items() for mesh in search.axes.meshes if (run := runs_by_mesh(search).get(mesh))]
 
 
 def table(searches):
     """A row for each mesh and pair: errors of the numbers by law."""
-    laws_ = [LAWS[law][0] for law in searches]
+    laws_ = [law.label for law in searches]
     header = ["elements", "tets", "dofs", "CPU s", *(f"{law}: {', '.join(map(short, KEYS))} off by %" for law in laws_)]
     made = {}
     for law, pair, cells, dofs, cpu, _, *errors in rows(searches):
@@ -67,7 +66,7 @@ def table(searches):
 def limits_table(searches):
     """Limits in space, what they may be off and whose they are."""
     return ["law", "number", "limit", "± %", "from"], [
-        [LAWS[law][0], short(key), f"{found.value:.5g}", f"{100 * found.uncertainty / abs(found.value):.2g}", found.how]
+        [law.label, short(key), f"{found.value:.5g}", f"{100 * found.uncertainty / abs(found.value):.2g}", found.how]
         for law, search in searches.items() for key in KEYS if (found := limit_of(search, key))]
 
 
@@ -88,21 +87,20 @@ def factors(searches):
                 told = ["-" if cost is None else ("≤ " if at_most else "") + f"{cost:.2g}" for cost, at_most in costs.values()]
                 doubtful = found.uncertainty > wanted / 2 * abs(found.value)
                 ratio = None if None in (two, one) or bound or other else two / one
-                made.append([LAWS[law][0], short(key), f"{100 * wanted:g} %", *told, "limit in doubt" if doubtful else text(ratio, "{:.1f}")])
+                made.append([law.label, short(key), f"{100 * wanted:g} %", *told, "limit in doubt" if doubtful else text(ratio, "{:.1f}")])
     return header, made
 
 
 def draw(path, searches):
     figure, axes = plt.subplots(1, len(KEYS), figsize=(14, 3.9), layout="constrained")
     for law, search in searches.items():
-        label, colour, _ = LAWS[law]
         runs = runs_by_mesh(search)
         for axis, key in zip(axes, KEYS):
             for pair in ELEMENTS:
                 points = sorted((runs[m].cpu, abs(error)) for m, error in in_space(search, key).items() if m.elements == pair and error)
                 if points:
-                    axis.plot(*zip(*points), "o-" if pair != "P3-P2" else "s--", ms=5, lw=0.7, color=colour, fillstyle=fill(pair),
-                              label=f"{label}, {pair}" if law == "birzle" else label if pair == "P2-P1" else None)
+                    axis.plot(*zip(*points), "o-" if pair != "P3-P2" else "s--", ms=5, lw=0.7, color=law.colour, fillstyle=fill(pair),
+                              label=f"{law.label}, {pair}" if law.name == "birzle" else law.label if pair == "P2-P1" else None)
     for axis, key in zip(axes, KEYS):
         logarithmic(axis, xlabel="CPU s", title=short(key))
     axes[0].set_ylabel("error in space")
@@ -125,7 +123,7 @@ def fields_lines(search):
 
 def run(folder, results, build):
     paths = laws.meshes(results / "meshes", laws.MESHES | FINEST)
-    searches = {law: search_of(law, paths, results, build) for law in LAWS}
+    searches = {law: search_of(law, paths, results, build) for law in laws.laws_of(build)}
     folder.mkdir(parents=True, exist_ok=True)
     made = {law: s for law, s in searches.items() if s.ladder.done}
     write_csv(folder / "elements.csv", ["law", "elements", "cells", "dofs", "cpu_s", "rejected_steps", *(f"error_{key}_percent" for key in KEYS)],
@@ -134,7 +132,7 @@ def run(folder, results, build):
     write_csv(folder / "factors.csv", f_header, f_rows)
     draw(folder / "elements.png", made)
     ratios = sorted(float(row[-1]) for row in f_rows if row[-1][0].isdigit())
-    left_out = [f"- {LAWS[law][0]}, {setting.name}: {why}" for law, s in searches.items() for setting, why in
+    left_out = [f"- {law.label}, {setting.name}: {why}" for law, s in searches.items() for setting, why in
                 [*((t, why) for t, (why, _) in s.ladder.failed.items()), *s.ladder.skipped.items()]]
     lines = ["# Elements: error in space over cost", "", "    tools/accuracy_study elements", "",
              "PCV with `-ventilator_ramp_down 0.1`, built-in right lung, backward Euler with Δt 0.1 s; CM1 with `-lumen_pressure`, CM5 with `reuse.opts`, the "
@@ -145,6 +143,6 @@ def run(folder, results, build):
              *markdown(f_header, f_rows), "",
              (f"P2-P1 over P1-P1: {ratios[0]:.1f} to {ratios[-1]:.1f}, median {statistics.median(ratios):.1f} ({len(ratios)} ratios)." if ratios
               else "No ratio is known."), "", "## The limits", "", *markdown(*limits_table(made)), "",
-             "## Fields (CM3)", "", *(fields_lines(made["birzle"]) if "birzle" in made else ["No run finished."]), "",
+             "## Fields (CM3)", "", *next((fields_lines(s) for law, s in made.items() if law.name == "birzle"), ["No run finished."]), "",
              "## Left out", "", *(left_out or ["Nothing."])]
     (folder / "README.md").write_text("\n".join(lines) + "\n")

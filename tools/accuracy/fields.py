@@ -13,12 +13,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import roots_jacobi
 
+from benchmarks.common import KPA_PER_CMH2O
+
 EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))  # of the nodes 4 to 9, the order of VTK
 INSIDE = -1e-9   # barycentric coordinates from here on are inside
 CHUNK = 200_000  # points that are worked on at a time
 NEAREST = (8, 64)  # centroids that are looked at, and for the points that are in none of these
 GAS = "alveolar_pressure_cmH2O"
-KPA_PER_CMH2O = 0.0980665
 SAME = 1e-4        # s: snapshots that are further apart are of different times; fields.xdmf has six digits
 
 

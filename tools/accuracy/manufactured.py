@@ -8,7 +8,7 @@ from pathlib import Path
 
 from benchmarks.common import SOURCE, fail, markdown, write_csv
 from benchmarks.keys import printed
-from benchmarks.plots import plt, save
+from benchmarks.plots import law_colours, plt, save
 
 from .extrapolate import limit
 from .pictures import logarithmic
@@ -20,7 +20,6 @@ CASES = {"DiscretisationError": "u and p of waves", "DiscretisationErrorOfDispla
 FORMAL = {"": {"u": 2, "Grad u": 2, "p": 2, "Grad p": 1}, "P1-P1": {"u": 2, "Grad u": 1, "p": 2, "Grad p": 1},
           "P3-P2": {"u": 3, "Grad u": 3, "p": 3, "Grad p": 2}}
 LINEAR = {"": {"u": 3, "Grad u": 2, "p": 3}, "P1-P1": {"u": 2, "Grad u": 1, "p": 2}, "P3-P2": {"u": 4, "Grad u": 3, "p": 4}}  # p in its space
-COLOURS = {"yoshihara": "#2a6fb0", "birzle": "#3b8f4a", "berger": "#c1272d", "ma": "#e08a1e"}
 
 
 def output(build, results):
@@ -68,12 +67,13 @@ def run(folder, results, build):
             rows.append([*key, count, " ".join(f"{e:.2e}" for _, e in ladder[:count]), "-" if found.order is None else f"{found.order:.2f}",
                          f"{found.value:+.1e}", f"{found.uncertainty:.1e}", "yes" if abs(found.value) <= found.uncertainty else "**no**"])
     write_csv(folder / "manufactured.csv", header, rows)
+    colours = law_colours(law for _, law, _ in ladders)
     kinds = list(dict.fromkeys(key[0] for key in ladders))
     figure, axes = plt.subplots(1, len(kinds), figsize=(3.4 * len(kinds), 3.8), layout="constrained", squeeze=False)
     for axis, kind in zip(axes[0], kinds):
         for (what, law, field), ladder in ladders.items():
             if what == kind:
-                axis.plot(*zip(*ladder), {"u": "o-", "p": "s--", "Grad u": "^-", "Grad p": "v--"}[field], ms=4, lw=0.8, color=COLOURS[law],
+                axis.plot(*zip(*ladder), {"u": "o-", "p": "s--", "Grad u": "^-", "Grad p": "v--"}[field], ms=4, lw=0.8, color=colours[law],
                           label=f"{field}, {law}" if law == "yoshihara" else None)
         logarithmic(axis, xlabel=kind.split(",")[0], title=kind.split(", ", 1)[1])
         axis.legend(fontsize=7)

@@ -9,14 +9,13 @@ import subprocess
 from pathlib import Path
 
 from . import plots, runs
-from .common import PAPER, SCENES, SOLVERS, SOURCE, blas, environment, fail, processor, require, write_table
+from .common import KPA_PER_CMH2O, PAPER, SCENES, SOLVERS, SOURCE, blas, environment, fail, processor, require, write_table
 from .strategies import measure, mesh_sentence, solver_words
 
 PEER = Path(__file__).parent / "peer_fenics.py"
 PACKAGE = "python3-dolfinx-real"
 AGREEMENT = 1e-6  # volumes of pulmo and peer, relative to the largest
 DT = 0.05  # s
-KPA_PER_CMH2O = 0.0980665
 HEADER = ["solver", "steps", "Newton", "Krylov", *(f"{s} s" for s in runs.STAGES), "wall s", "CPU s", "memory MB",
           "volume difference"]
 

@@ -1,5 +1,6 @@
-"""What all benchmarks share: places, environment, machine, tables."""
+"""What all tools share: places, environment, what the program offers, machine, tables."""
 import csv
+import functools
 import os
 import platform
 import subprocess
@@ -10,6 +11,7 @@ SOURCE = Path(__file__).resolve().parent.parent.parent
 SCENES = SOURCE / "petsc_options/scenes"
 PAPER = ["-options_file", SCENES / "paper.opts"]  # the readings that the studies were made with
 SOLVERS = SOURCE / "petsc_options/solvers"
+KPA_PER_CMH2O = 0.0980665
 PLAIN = "-predictor_increments 0 -snes_lag_jacobian 1 -snes_lag_preconditioner 1"  # Newton's method with nothing spared
 
 
@@ -39,6 +41,31 @@ def environment():
     """One BLAS thread; Open MPI may run as root in containers."""
     return dict(os.environ, OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1", OMPI_ALLOW_RUN_AS_ROOT="1",
                 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM="1")
+
+
+@functools.cache
+def offered(program, kind):
+    """What a program offers of a kind (`tissue` or `permeability` laws, `effect`), by its -list: {name: alias, or nothing}."""
+    run = subprocess.run([program, "-list"], capture_output=True, text=True, env=environment())
+    if run.returncode:
+        fail(f"{program} -list ends with code {run.returncode}: {run.stderr.strip()}")
+    lines = [line.split() for line in run.stdout.splitlines()]
+    return {name: alias for this, names, *_ in lines if this == kind for name, _, alias in [names.partition("|")]}
+
+
+def tissue_laws(program):
+    """Names of the tissue laws that a program offers, CM1 to CM5 first."""
+    laws = offered(program, "tissue")
+    return sorted(laws, key=lambda law: (not laws[law], laws[law]))
+
+
+def laws_of(options):
+    """The tissue laws that a call names with --laws, or all that its build offers."""
+    there = tissue_laws(options.build / "pulmo")
+    unknown = [law for law in options.laws or [] if law not in there]
+    if unknown:
+        fail(f"--laws {unknown[0]} is not offered by {options.build / 'pulmo'}, which has {', '.join(there)}")
+    return options.laws or there
 
 
 def require(build, meshes):

@@ -15,6 +15,15 @@ class Pyplot:
 plt = Pyplot()
 COLOURS = {"setup": "#9a9a9a", "residual": "#e0a83a", "jacobian": "#3b7d4f", "solve": "#2f6c9e", "output": "#b5403a"}
 
+LAW_COLOURS = {"berger": "#c1272d", "ma": "#e08a1e", "birzle": "#3b8f4a", "yoshihara": "#2a6fb0", "rausch": "#6a4c93"}
+OTHERS = ["#444444", "#8c564b", "#17a2b8", "#b8860b"]  # laws that came later
+
+
+def law_colours(laws):
+    """Colours of laws by name."""
+    later = [law for law in dict.fromkeys(laws) if law not in LAW_COLOURS]
+    return LAW_COLOURS | {law: OTHERS[i % len(OTHERS)] for i, law in enumerate(later)}
+
 
 def save(figure, path, title):
     """Gives a figure its title and writes it."""

@@ -5,7 +5,6 @@ from scipy.optimize import brentq, minimize_scalar
 from .lab import case, number, pulmo
 
 FREE = pulmo.DIRECT + pulmo.STILL + pulmo.PINS  # no airflow, no springs: F = J^(1/3) I, p = dW/dJ
-LAWS = ["berger", "ma", "birzle", "yoshihara", "rausch"]
 FOLDS = ("The tissue turned inside out: J = ", "in the cell at (")
 
 
@@ -40,10 +39,12 @@ def suction(lab):
     """J falls towards 1 − Φ0, where no air is left. CM2 to CM5 have no barrier there: nothing in the model keeps the
     porosity positive, so pulmo has to say when it is not. CM2 has no shear stiffness below J = 0.58: on the lung there is nothing left to
     converge to."""
-    for law in LAWS:
+    for law in pulmo.tissue_laws():
         run = lab.finished(FREE + pulmo.BLOCK + ["-tissue", law] + pulmo.programme("suction 1 pressure -20 ramp 1"),
                            f"{law} at −20 cmH2O")
-        if run:
+        if run and law not in pulmo.CLOSED_FORMS:
+            lab.demand(f"J of {law}, free: not compared, pulmo_case.py has no closed form", run.signals()["min_J"][-1], "any", True)
+        elif run:
             J = inflated(law, -20, 0.0101 if law == "berger" else 1e-3, 1)
             lab.within(f"J of {law}, free", run.signals()["min_J"][-1], J, 1e-6)
     # the barrier of CM1: J − (1 − Φ0) beside its closed form

@@ -15,11 +15,12 @@ import signal
 import sys
 from pathlib import Path
 
-from benchmarks.common import SOURCE
+from benchmarks.common import SOURCE, tissue_laws
 
 from .breaths import table2, tried
 from .cases import QUICK, Cases, Plan
 from .compartment import figure4
+from .laws import LAWS
 from .messages import fail, say
 from .outcome import Results
 from .page import write_page
@@ -86,6 +87,9 @@ def main(arguments):
             for run in cases.parts[part]:
                 print(f"           {'done' if workshop.done(run) else '    '} {run.name}")
         return 0
+    others = [law for law in tissue_laws(workshop.program) if law not in {law.name for law in LAWS}]
+    if others:
+        say(f"not of the paper and left out: {', '.join(others)}")
     wanted = {run.name: run for part in given.parts for run in cases.parts[part]}
     wrong = {run.name for run in workshop.carry_out(list(wanted.values()))}
     results = Results(workshop, cases)
