@@ -19,8 +19,8 @@ import numpy as np
 
 SOURCE = os.environ.get("PULMO_SOURCE_DIR", os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))))
 sys.path.insert(0, os.path.join(SOURCE, "tools"))
-from benchmarks import common  # noqa: E402
-from benchmarks.common import KPA_PER_CMH2O  # noqa: E402, F401: of the tests
+from shared import common  # noqa: E402
+from shared.common import KPA_PER_CMH2O  # noqa: E402, F401: of the tests
 
 PROGRAM, LAUNCHER = None, ["mpiexec", "--oversubscribe", "-n"]
 _scratch = tempfile.TemporaryDirectory(prefix="pulmo_case_")

@@ -22,8 +22,9 @@ import pulmo_case as pulmo
 sys.path.insert(0, os.path.join(pulmo.SOURCE, "tools"))
 sys.path.insert(0, os.path.join(pulmo.SOURCE, "tests/support"))
 import failed_tests  # noqa: E402
-from benchmarks import assembly, common, keys, memory, operations, scaling  # noqa: E402
+from benchmarks import assembly, memory, operations, scaling  # noqa: E402
 from hardcases import gallery, page  # noqa: E402
+from shared import common, keys  # noqa: E402
 
 
 def tool(name, *arguments):

@@ -11,8 +11,8 @@ import statistics
 from pathlib import Path
 
 from benchmarks import runs
-from benchmarks.common import PAPER, SCENES, SOLVERS, SOURCE, environment, fail, markdown, require, tissue_laws, write_csv
-from benchmarks.keys import printed
+from shared.common import PAPER, SCENES, SOLVERS, SOURCE, environment, fail, markdown, require, tissue_laws, write_csv
+from shared.keys import printed
 
 from . import truth
 from .numbers import short

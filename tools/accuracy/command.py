@@ -21,9 +21,9 @@ import signal
 import sys
 from pathlib import Path
 
-from benchmarks.common import SOURCE, fail, require
-from benchmarks.keys import lock
 from benchmarks.strategies import scene_file
+from shared.common import SOURCE, fail, require
+from shared.keys import lock
 
 from . import page, settings
 from .errors import Axes

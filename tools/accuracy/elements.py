@@ -1,8 +1,8 @@
 """Which elements: what P2-P1, P1-P1 and P3-P2 cost for the same error in space, for every tissue law on the built-in right lung."""
 import statistics
 
-from benchmarks.common import markdown, write_csv
 from benchmarks.plots import plt, save
+from shared.common import markdown, write_csv
 
 from . import command, laws, page
 from .numbers import KEYS, short

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import roots_jacobi
 
-from benchmarks.common import KPA_PER_CMH2O
+from shared.common import KPA_PER_CMH2O
 
 EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))  # of the nodes 4 to 9, the order of VTK
 INSIDE = -1e-9   # barycentric coordinates from here on are inside

@@ -2,9 +2,9 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.common import SOURCE, markdown, offered, tissue_laws, write_csv
-from benchmarks.keys import make_mesh
 from benchmarks.plots import law_colours, plt, save
+from shared.common import SOURCE, markdown, offered, tissue_laws, write_csv
+from shared.keys import make_mesh
 
 from . import command, page
 from .extrapolate import limit, observed_order

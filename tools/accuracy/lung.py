@@ -1,7 +1,7 @@
 """The built-in pair of lungs: a question answered within ten minutes, and a run far finer that checks the answer."""
 import math
 
-from benchmarks.common import markdown, write_csv
+from shared.common import markdown, write_csv
 
 from . import command, settings
 from .errors import in_time

@@ -6,9 +6,9 @@ uncertainty, from the errors at finite sizes alone.
 import re
 from pathlib import Path
 
-from benchmarks.common import SOURCE, fail, markdown, write_csv
-from benchmarks.keys import printed
 from benchmarks.plots import law_colours, plt, save
+from shared.common import SOURCE, fail, markdown, write_csv
+from shared.keys import printed
 
 from .extrapolate import limit
 from .pictures import logarithmic

@@ -3,7 +3,7 @@ import math
 import shlex
 
 from benchmarks import runs as benchmark_runs
-from benchmarks.common import blas, markdown, processor, write_csv
+from shared.common import blas, markdown, processor, write_csv
 
 from . import fields, pictures
 from .numbers import file_name, percent, short

@@ -2,7 +2,7 @@
 import math
 from dataclasses import dataclass
 
-from benchmarks.common import fail
+from shared.common import fail
 
 from .errors import LOOSE, estimate
 from .numbers import percent, short

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import meshio
 
-from benchmarks.common import SOLVERS, fail
-from benchmarks.keys import make_mesh
+from shared.common import SOLVERS, fail
+from shared.keys import make_mesh
 
 from .numbers import percent
 

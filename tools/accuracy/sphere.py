@@ -3,9 +3,9 @@ import math
 import shlex
 
 from benchmarks import runs
-from benchmarks.common import markdown, write_csv
-from benchmarks.keys import make_mesh
 from benchmarks.plots import plt, save
+from shared.common import markdown, write_csv
+from shared.keys import make_mesh
 
 from . import command, truth
 from .extrapolate import limit as limit_of

@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 
-from benchmarks.common import KPA_PER_CMH2O, SOURCE
+from shared.common import KPA_PER_CMH2O, SOURCE
 
 sys.path.insert(0, str(SOURCE / "tests/verification/hollow_sphere"))
 from radial import Pressure, Radial, Shell, breathe  # noqa: E402

@@ -11,9 +11,10 @@ import subprocess
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from shared.common import PAPER, SCENES, SOLVERS, SOURCE, environment, fail, laws_of, markdown, processor, show, write_csv, write_table
+from shared.keys import make_lung
+
 from . import operations
-from .common import PAPER, SCENES, SOLVERS, SOURCE, environment, fail, laws_of, markdown, processor, show, write_csv, write_table
-from .keys import make_lung
 
 COUNTED = SOURCE / "meshes/lung_test.msh"
 ROOFLINE = ["law", "of", "µs/cell", "flops/cell", "divisions/cell", "bytes/cell", "flops/byte", "µs at peak", "µs at bandwidth",

@@ -8,8 +8,9 @@ import statistics
 import subprocess
 from pathlib import Path
 
+from shared.common import KPA_PER_CMH2O, PAPER, SCENES, SOLVERS, SOURCE, blas, environment, fail, processor, require, write_table
+
 from . import plots, runs
-from .common import KPA_PER_CMH2O, PAPER, SCENES, SOLVERS, SOURCE, blas, environment, fail, processor, require, write_table
 from .strategies import measure, mesh_sentence, solver_words
 
 PEER = Path(__file__).parent / "peer_fenics.py"

@@ -8,8 +8,9 @@ its end.
 import re
 from pathlib import Path
 
+from shared.common import SCENES, SOURCE, blas, laws_of, markdown, processor, require, show, write_table
+
 from . import runs
-from .common import SCENES, SOURCE, blas, laws_of, markdown, processor, require, show, write_table
 from .strategies import measure, mesh_sentence, solver_words
 
 BREATHS = {"PCV 15/5": ("pcv", "-ventilator_pip 15 -ventilator_peep 5"), "PCV 25/10": ("pcv", "-ventilator_pip 25 -ventilator_peep 10"),

@@ -7,9 +7,10 @@ factors over that step (`-snes_lag_jacobian -2`): more factorisations need the s
 import math
 from pathlib import Path
 
+from shared.common import PAPER, SCENES, SOURCE, processor, require, write_table
+from shared.keys import make_lung
+
 from . import plots, runs
-from .common import PAPER, SCENES, SOURCE, processor, require, write_table
-from .keys import make_lung
 from .plots import plt
 from .strategies import measure, solver_words
 

@@ -10,7 +10,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
-from .common import SOURCE, environment, fail
+from shared.common import SOURCE, environment, fail
 
 CACHE = ["--D1=32768,8,64", "--LL=1048576,8,64"]
 FUNCTIONS = {"residual": "pulmo::Model::residual*", "jacobian": "pulmo::Model::jacobian*"}

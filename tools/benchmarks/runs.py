@@ -15,8 +15,8 @@ import sys
 import time
 from pathlib import Path
 
-from .common import environment
-from .keys import digest
+from shared.common import environment
+from shared.keys import digest
 
 STAGES = ["setup", "residual", "jacobian", "solve", "output"]
 POLL = 0.05  # s between looks at a running program

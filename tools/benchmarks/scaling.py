@@ -15,9 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
+from shared.common import PAPER, PLAIN, SCENES, SOURCE, blas, fail, markdown, processor, require, show, write_csv, write_table
+from shared.keys import make_lung
+
 from . import plots, runs
-from .common import PAPER, PLAIN, SCENES, SOURCE, blas, fail, markdown, processor, require, show, write_csv, write_table
-from .keys import make_lung
 from .plots import plt
 from .strategies import solver_words
 

@@ -14,8 +14,9 @@ the gas would not reach the whole lung in that time.
 import re
 from pathlib import Path
 
+from shared.common import PLAIN, PAPER, SCENES, SOURCE, blas, fail, laws_of, processor, require, write_table
+
 from . import plots, runs
-from .common import PLAIN, PAPER, SCENES, SOURCE, blas, fail, laws_of, processor, require, write_table
 from .strategies import measure, solver_words
 
 NEW = [*PLAIN.split(), "-snes_ksp_ew", "0", "-ksp_rtol", "1e-5", "-ksp_converged_reason", "-progress", "on"]

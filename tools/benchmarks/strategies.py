@@ -3,8 +3,9 @@ import shlex
 import statistics
 from pathlib import Path
 
+from shared.common import SCENES, SOLVERS, SOURCE, blas, fail, processor, require, write_table
+
 from . import plots, runs
-from .common import SCENES, SOLVERS, SOURCE, blas, fail, processor, require, write_table
 
 HEADER = ["flags", "outcome", "steps", "rejected", "Newton", "Krylov", "Krylov/Newton", "wall s", *(f"{s} s" for s in runs.STAGES),
           "CPU s", "memory MB", "volume difference", "pressure difference", "remark"]

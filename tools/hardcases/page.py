@@ -1,8 +1,8 @@
 """The page of the gallery: table, list of what was missed, figures, CSV."""
 import numpy as np
 
-from benchmarks.common import markdown, write_csv
 from benchmarks.plots import plt
+from shared.common import markdown, write_csv
 
 from .lab import pulmo
 from .laws import limit_point

@@ -15,7 +15,7 @@ import signal
 import sys
 from pathlib import Path
 
-from benchmarks.common import SOURCE, tissue_laws
+from shared.common import SOURCE, tissue_laws
 
 from .breaths import table2, tried
 from .cases import QUICK, Cases, Plan

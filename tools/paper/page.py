@@ -1,5 +1,5 @@
 """README.md of the reproduction."""
-from benchmarks.common import SOURCE
+from shared.common import SOURCE
 
 from .breaths import coarse_text, table2_page, tried_page
 from .cases import QUICK

@@ -4,8 +4,8 @@ import os
 import subprocess
 import time
 
-from benchmarks import keys
-from benchmarks.common import SOURCE, environment
+from shared import keys
+from shared.common import SOURCE, environment
 
 from .messages import say
 from .outcome import read_json, reason
