@@ -21,9 +21,10 @@ install(FILES ${PROJECT_BINARY_DIR}/pulmo-config.cmake ${PROJECT_BINARY_DIR}/pul
 install(DIRECTORY include/pulmo DESTINATION ${CMAKE_INSTALL_INCLUDEDIR})
 
 install(DIRECTORY petsc_options meshes DESTINATION ${data})
-install(PROGRAMS tools/report tools/lung_mesh tools/sphere_mesh tools/accuracy_cost tools/reproduce_paper
+install(PROGRAMS tools/report tools/lung_mesh tools/sphere_mesh tools/cell_values tools/accuracy_cost tools/reproduce_paper
         DESTINATION ${data}/tools)
-install(DIRECTORY tools/accuracy tools/benchmarks tools/meshing tools/paper tools/shared DESTINATION ${data}/tools FILES_MATCHING PATTERN "*.py")
+install(DIRECTORY tools/accuracy tools/benchmarks tools/meshing tools/paper tools/reports tools/shared
+        DESTINATION ${data}/tools FILES_MATCHING PATTERN "*.py")
 install(FILES docs/paper/page.md.in DESTINATION ${data}/docs/paper)
 # the tools' build/pulmo is the installed program
 file(RELATIVE_PATH to_program ${CMAKE_INSTALL_FULL_DATADIR}/pulmo ${CMAKE_INSTALL_FULL_BINDIR})

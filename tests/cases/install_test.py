@@ -69,7 +69,7 @@ class Install(unittest.TestCase):
         data = self.path("share/pulmo")
         tool = call(os.path.join(data, "tools/reproduce_paper"), "--list", cwd=pulmo.scratch("..")).stdout
         self.assertIn("table2", tool)
-        for name in "tools/report", "tools/lung_mesh", "tools/sphere_mesh", "tools/accuracy_cost":
+        for name in "tools/report", "tools/lung_mesh", "tools/sphere_mesh", "tools/cell_values", "tools/accuracy_cost":
             run = call(os.path.join(data, name), "--help")
             self.assertEqual(run.returncode, 0, run.stdout)
         self.assertTrue(os.path.samefile(os.path.join(data, "build/pulmo"), self.path("bin/pulmo")))

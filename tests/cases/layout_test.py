@@ -1,4 +1,4 @@
-"""The folders of the code: includes run one way, and every source says what it is for."""
+"""The folders of the code: includes run one way, every source says what it is for, and tools are doors to modules."""
 import os
 import re
 import unittest
@@ -9,6 +9,9 @@ import pulmo_case as case
 FOLDERS = ["base", "input", "mesh", "physics", "fem", "solvers", "time", "observers", "program"]
 # What a kernel is made of knows no mesh, no options file and no solver.
 KERNELS = ["kinematics", "point", "tissue_law", "permeability"]
+# A tool reads its command line and calls the modules of a folder beside it.
+DOOR = 80  # lines at most
+ALONE = {"setup": "one shell script, which runs where nothing is installed yet"}
 INCLUDE = re.compile(r'#include "pulmo/([\w/]+)\.hpp"')
 
 
@@ -78,6 +81,26 @@ class Layout(unittest.TestCase):
                 said = text.startswith("// ") or os.path.isfile(os.path.join(case.SOURCE, header))
             if not said:
                 silent.append(path)
+        self.assertEqual(silent, [])
+
+    def tools(self):
+        """(name, lines) of what a user calls."""
+        folder = os.path.join(case.SOURCE, "tools")
+        for name in sorted(os.listdir(folder)):
+            if os.path.isfile(os.path.join(folder, name)):
+                yield name, text_of(os.path.join("tools", name)).splitlines()
+
+    def test_tools_are_doors(self):
+        tall = {name: len(lines) for name, lines in self.tools() if len(lines) > DOOR}
+        self.assertEqual(sorted(tall), sorted(ALONE), f"more than {DOOR} lines: {tall}; move the work to a folder of modules")
+
+    def test_tools_and_their_modules_say_what_they_are_for(self):
+        silent = [name for name, lines in self.tools() if not lines[0].startswith("#!") or lines[1][:2] not in ('""', "# ")]
+        for where, _, files in os.walk(os.path.join(case.SOURCE, "tools")):
+            for name in files:
+                path = os.path.relpath(os.path.join(where, name), case.SOURCE)
+                if name.endswith(".py") and not re.match(r'(#!.*\n)?"""', text_of(path)):
+                    silent.append(path)
         self.assertEqual(silent, [])
 
 

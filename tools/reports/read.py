@@ -1,0 +1,62 @@
+"""What a run left, finished or not: signals and numbers, or one sentence on why there are none."""
+import csv
+import json
+import os
+import sys
+
+
+def fail(message):
+    sys.exit(f"report: error: {message}")
+
+
+def whole_rows(path):
+    """Rows of a table; one that is not written to its end yet is left out."""
+    with open(path, newline="") as f:
+        text = f.read()
+    return list(csv.DictReader(text[:text.rfind("\n") + 1].splitlines()))
+
+
+def read_signals(directory):
+    """Columns of signals.csv, or of signals.csv.part: name -> list (numbers, but text for the phase)."""
+    path = os.path.join(directory, "signals.csv")
+    if not os.path.isdir(directory):
+        fail(f"there is no directory {directory}; name the -output_dir of a run")
+    if not os.path.exists(path):
+        path += ".part"
+    if not os.path.exists(path):
+        fail(f"neither signals.csv nor signals.csv.part is in {directory}; this is no directory of a run")
+    rows = whole_rows(path)
+    if not rows or "time_s" not in rows[0] or "volume_ml" not in rows[0]:
+        fail(f"{path} holds no steps of pulmo")
+    if len(rows) < 2:
+        fail(f"{path} holds the start of a run and no step yet")
+    try:
+        return {name: [row[name] if name == "phase" else float(row[name]) for row in rows] for name in rows[0]}
+    except (TypeError, ValueError):
+        fail(f"{path} is damaged: a value is missing or not a number")
+
+
+def read_summary(directory, end):
+    """What summary.json says, or failure.json, and why the run is not finished (empty if it is). `end`: of its rows, s."""
+    for name in "summary.json", "failure.json":
+        path = os.path.join(directory, name)
+        try:
+            with open(path) as f:
+                summary = json.load(f)
+        except FileNotFoundError:
+            continue
+        except json.JSONDecodeError as error:
+            fail(f"{path} is damaged: {error}")
+        return summary, f"FAILED: {summary.get('failure', 'no reason given')}" if name == "failure.json" else ""
+    return {}, f"NOT FINISHED: at work, stopped or killed; rows up to {end:g} s"
+
+
+def phase_spans(signals):
+    """(name, begin, end) of each phase; a row at a switch belongs to the phase that ends."""
+    time, phase = signals["time_s"], signals["phase"]
+    spans = []
+    for i in range(1, len(time)):
+        if not spans or phase[i] != spans[-1][0]:
+            spans.append([phase[i], time[i - 1], time[i]])
+        spans[-1][2] = time[i]
+    return spans
