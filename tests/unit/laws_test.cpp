@@ -106,6 +106,88 @@ TEST(Laws, TangentIsTheDerivativeOfTheStress)
   });
 }
 
+TEST(Laws, DerivativesByHandAreThoseOfTheEnergy)
+{
+  const auto check = [](const TissueLaw &law, const PointState &s, const std::string &where) {
+    SCOPED_TRACE(where);
+    const auto alone = law.energy_alone();
+    Tensor P, of_energy;
+    std::array<double, 81> A, of_stress;
+    law.stress(s, P.data());
+    law.tangent(s, A.data());
+    alone->stress(s, of_energy.data());
+    alone->tangent(s, of_stress.data());
+    EXPECT_EQ(alone->energy(s), law.energy(s));
+    // the largest numbers that a stress is summed of
+    const double scale = largest(P) + largest_entry(A);
+    EXPECT_LT(largest(P - of_energy), 2e-15 * scale);
+    for (std::size_t i = 0; i < A.size(); ++i) EXPECT_NEAR(A[i], of_stress[i], 4e-15 * scale);
+  };
+  over_states([&](const TissueLaw &law, const Tensor &F) { check(law, state_of_F(F), ""); });
+  for (const auto &law : Registry::standard().make_tissue_laws()) {
+    Random random(41);
+    for (double size : {0., 1e-9, 1e-6, 1e-3}) {
+      PointState s;
+      const Tensor H = random.tensor(size);
+      make_point_state(H.data(), nullptr, s);
+      check(*law, s, std::string(law->name()) + " near rest, " + std::to_string(size));
+    }
+  }
+}
+
+/// W alone, of all three invariants; with @p Says it says that it uses I2.
+template <bool Says>
+struct OfAllInvariants {
+  static constexpr const char *name = "all", *alias = "all", *source = "the test";
+  static constexpr bool uses_I2 = Says;
+  struct Parameters {
+    static constexpr const char *owner = "tissue";
+    PetscScalar c = 0.7;
+  };
+  static PetscErrorCode declare(Options &, Parameters &) { return PETSC_SUCCESS; }
+  template <class T>
+  static T W(const Invariants<T> &inv, const Parameters &k)
+  {
+    const T a = inv.I1_minus_3, b = inv.I2_minus_3, j = inv.J_minus_1;
+    return k.c * (a + 2 * b) + sqrt(1 + a * a + pow(b, 2) / 3) * inv.power_of_I3_minus_1(0.4) +
+           log(inv.J) * exp(j * b) + a * b * log1p(j) / inv.J + whole_power(j, 3);
+  }
+};
+
+TEST(Laws, TheEnergyAloneIsALaw)
+{
+  const TissueLawOf<OfAllInvariants<true>> law;
+  Random random(43);
+  for (double J : {0.5, 1.0, 1.6})
+    for (int n = 0; n < 4; ++n) {
+      const Tensor F = random_deformation(random, J), P = stress(law, F);
+      const auto A = tangent(law, F);
+      for (int c = 0; c < 9; ++c) {
+        const auto moved = [&](double step) {
+          Tensor G = F;
+          G[c] += step;
+          return G;
+        };
+        EXPECT_NEAR(P[c], derivative([&](double step) { return energy(law, moved(step)); }, h),
+                    1e-9 * (largest(P) + std::abs(energy(law, F))));
+        for (int i = 0; i < 3; ++i)
+          for (int j = 0; j < 3; ++j)
+            EXPECT_NEAR(A[entry(i, j, c / 3, c % 3)],
+                        derivative([&](double step) { return stress(law, moved(step))[3 * i + j]; }, h),
+                        1e-9 * largest_entry(A));
+      }
+    }
+}
+
+TEST(Laws, AnInvariantThatALawDoesNotAskForIsNoNumber)
+{
+  Random random(47);
+  const Tensor F = random_deformation(random, 1.2);
+  const TissueLawOf<OfAllInvariants<false>> law;
+  EXPECT_TRUE(std::isnan(energy(law, F)));
+  for (double p : stress(law, F)) EXPECT_TRUE(std::isnan(p));
+}
+
 TEST(Laws, TangentHasMajorSymmetry)
 {
   over_states([](const TissueLaw &law, const Tensor &F) {

@@ -7,14 +7,20 @@
 ///   static constexpr bool uses_I2;                        whether W depends on I2 at all
 ///   struct Parameters { static constexpr const char *owner = "tissue"; PetscScalar ...; };
 ///   static PetscErrorCode declare(Options &, Parameters &);
-///   static EnergyDerivatives energy(const Invariants &, const Parameters &);
+///   template <class T> static T W(const Invariants<T> &, const Parameters &);   energy density, kPa
 ///
-/// and one line in src/physics/registry.cpp.
+/// and one line in src/physics/registry.cpp. The derivatives of W come from dual numbers. A law that also has
+///
+///   static EnergyDerivatives derivatives(const Invariants<> &, const Parameters &);
+///
+/// takes these instead: faster, and compared with the others by the tests.
 #pragma once
 
+#include "pulmo/physics/dual.hpp"
 #include "pulmo/physics/point.hpp"
 
 #include <cmath>
+#include <limits>
 #include <memory>
 
 namespace pulmo {
@@ -22,37 +28,115 @@ namespace pulmo {
 class Options;
 
 /// Invariants of C = F^T F as differences from the reference state, free of cancellation near F = I.
+template <class T = PetscScalar>
 struct Invariants {
-  PetscScalar I1_minus_3; ///< tr C - 3
-  PetscScalar I2_minus_3; ///< 1/2 [(tr C)^2 - tr C^2] - 3 (only set for laws that use I2)
-  PetscScalar J_minus_1;  ///< det F - 1
-  PetscScalar J;          ///< det F
+  T I1_minus_3; ///< tr C - 3
+  T I2_minus_3; ///< 1/2 [(tr C)^2 - tr C^2] - 3; not a number for laws that do not say that they use it
+  T J_minus_1;  ///< det F - 1
+  T J;          ///< det F
 
-  /// ln J, accurate near J = 1.
-  PetscScalar log_J() const { return std::log1p(J_minus_1); }
+  // accurate near the reference state:
+  /// ln J.
+  T log_J() const { return log1p(J_minus_1); }
+  /// I3^n - 1 with I3 = J^2.
+  T power_of_I3_minus_1(PetscScalar n) const { return expm1(2 * n * log_J()); }
+  /// I1 I3^(-1/3) - 3.
+  T isochoric_I1_minus_3() const
+  {
+    const T y = power_of_I3_minus_1(1. / 3);
+    return (I1_minus_3 - 3 * y) / (1 + y);
+  }
 };
 
-/// W (kPa) and its derivatives with I1, I2 and J as independent variables (I3 = J^2).
+/// Derivatives of W (kPa) with I1, I2 and J as independent variables (I3 = J^2).
 struct EnergyDerivatives {
-  PetscScalar W = 0;
   PetscScalar W1 = 0, W2 = 0, WJ = 0;
   PetscScalar W11 = 0, W12 = 0, W1J = 0, W22 = 0, W2J = 0, WJJ = 0;
 };
 
 /// x^n for a small whole n >= 0.
-static inline PetscScalar whole_power(PetscScalar x, int n)
+template <class T>
+T whole_power(T x, int n)
 {
-  PetscScalar r = 1;
+  T r = 1;
   for (; n > 0; n >>= 1, x *= x)
     if (n & 1) r *= x;
   return r;
 }
 
+/// Whether a law has the derivatives of its W by hand.
+template <class Law, class = void>
+constexpr bool has_derivatives = false;
+template <class Law>
+constexpr bool
+    has_derivatives<Law, std::void_t<decltype(Law::derivatives(std::declval<const Invariants<> &>(),
+                                                               std::declval<const typename Law::Parameters &>()))>> =
+        true;
+
+/// A law that gives its W alone, whatever else it has.
+template <class Law>
+struct EnergyAlone {
+  static constexpr const char *name = Law::name, *alias = Law::alias, *source = Law::source;
+  static constexpr bool uses_I2 = Law::uses_I2;
+  using Parameters = typename Law::Parameters;
+  static PetscErrorCode declare(Options &options, Parameters &k) { return Law::declare(options, k); }
+  template <class T>
+  static T W(const Invariants<T> &inv, const Parameters &k)
+  {
+    return Law::W(inv, k);
+  }
+};
+
+/// W of a law with the dual numbers @p D in place of its invariants: I1, J, and I2 if the law uses it.
+template <class Law, class D, class T, int N>
+D dual_energy(const T (&value)[N], const typename Law::Parameters &k)
+{
+  D at[N], I2(std::numeric_limits<PetscScalar>::quiet_NaN());
+  seed(value, at);
+  if constexpr (Law::uses_I2)
+    I2 = at[2];
+  else
+    I2.d.fill(I2.v); // what is not offered must not pass for a constant
+  return Law::W(Invariants<D>{at[0], I2, at[1], at[1] + 1.0}, k);
+}
+
+/// The derivatives of a law: its own, or those that dual numbers give; second ones only if @p second.
+template <class Law, bool second>
+EnergyDerivatives energy_derivatives(const Invariants<> &inv, const typename Law::Parameters &k)
+{
+  if constexpr (has_derivatives<Law>) {
+    return Law::derivatives(inv, k);
+  } else {
+    constexpr int n = Law::uses_I2 ? 3 : 2, I1 = 0, J = 1, I2 = n - 1; // I2: if the law uses it
+    using D = Dual<PetscScalar, n>;
+    EnergyDerivatives e;
+    PetscScalar value[n] = {inv.I1_minus_3, inv.J_minus_1};
+    if constexpr (Law::uses_I2) value[I2] = inv.I2_minus_3;
+    if constexpr (second) {
+      D once[n];
+      seed(value, once);
+      const Dual<D, n> W = dual_energy<Law, Dual<D, n>>(once, k);
+      e.W1 = W.v.d[I1], e.WJ = W.v.d[J];
+      e.W11 = W.d[I1].d[I1], e.W1J = W.d[I1].d[J], e.WJJ = W.d[J].d[J];
+      if constexpr (Law::uses_I2) {
+        e.W2 = W.v.d[I2];
+        e.W12 = W.d[I1].d[I2], e.W22 = W.d[I2].d[I2], e.W2J = W.d[I2].d[J];
+      }
+    } else {
+      const D W = dual_energy<Law, D>(value, k);
+      e.W1 = W.d[I1], e.WJ = W.d[J];
+      if constexpr (Law::uses_I2) e.W2 = W.d[I2];
+    }
+    return e;
+  }
+}
+
 /// The invariants at a point; C (9 entries) is filled only if @p with_I2.
-static inline Invariants invariants(const PointState &s, bool with_I2, PetscScalar C[9])
+static inline Invariants<> invariants(const PointState &s, bool with_I2, PetscScalar C[9])
 {
   const PetscScalar *H = s.H;
-  Invariants inv{2 * (H[0] + H[4] + H[8]) + contract(H, H), 0, s.J_minus_1, s.J};
+  Invariants<> inv{2 * (H[0] + H[4] + H[8]) + contract(H, H), std::numeric_limits<PetscScalar>::quiet_NaN(),
+                   s.J_minus_1, s.J};
   if (with_I2) {
     PetscScalar D[9]; // C - I
     for (int i = 0; i < 3; ++i)
@@ -70,7 +154,7 @@ struct TissueKernels {
   using Parameters = typename Law::Parameters;
 
   /// dI2/dF / 2 = I1 F - F C.
-  static void half_dI2_dF(const PointState &s, const Invariants &inv, const PetscScalar C[9], PetscScalar B[9])
+  static void half_dI2_dF(const PointState &s, const Invariants<> &inv, const PetscScalar C[9], PetscScalar B[9])
   {
     const PetscScalar I1 = inv.I1_minus_3 + 3;
     for (int i = 0; i < 3; ++i)
@@ -85,8 +169,8 @@ struct TissueKernels {
   {
     const PointState &s = point.state;
     PetscScalar C[9];
-    const Invariants inv = invariants(s, Law::uses_I2, C);
-    const EnergyDerivatives e = Law::energy(inv, k);
+    const Invariants<> inv = invariants(s, Law::uses_I2, C);
+    const EnergyDerivatives e = energy_derivatives<Law, false>(inv, k);
     for (int i = 0; i < 9; ++i) f1[i] += 2 * e.W1 * s.F[i] + e.WJ * s.cof_F[i];
     if constexpr (Law::uses_I2) {
       PetscScalar B[9];
@@ -99,7 +183,7 @@ struct TissueKernels {
   static PetscScalar energy(const PointState &s, const Parameters &k)
   {
     PetscScalar C[9];
-    return Law::energy(invariants(s, Law::uses_I2, C), k).W;
+    return Law::W(invariants(s, Law::uses_I2, C), k);
   }
 
   /// Growth of W over a step, kPa.
@@ -123,8 +207,8 @@ struct TissueKernels {
     const PointState &s = point.state;
     const PetscScalar *F = s.F, *cof = s.cof_F;
     PetscScalar C[9], B[9];
-    const Invariants inv = invariants(s, Law::uses_I2, C);
-    const EnergyDerivatives e = Law::energy(inv, k);
+    const Invariants<> inv = invariants(s, Law::uses_I2, C);
+    const EnergyDerivatives e = energy_derivatives<Law, true>(inv, k);
 
     // second derivatives: sum over a, b of W_ab (dI_a/dF) x (dI_b/dF); X[iJ] collects what multiplies each factor
     PetscScalar XF[9], XB[9], Xcof[9];
@@ -196,6 +280,8 @@ public:
   virtual Callback<EnergyDensity> stored_callback() const = 0;
   virtual Callback<EnergyDensity> numerical_callback() const = 0;
   virtual LawFunctions functions() const = 0;
+  /// The same law with all derivatives from its W by dual numbers (tests compare both).
+  virtual std::unique_ptr<TissueLaw> energy_alone() const = 0;
   /// Strain energy density W at a state, kPa.
   virtual PetscScalar energy(const PointState &state) const = 0;
   /// P' = dW/dF at a state, kPa, with the parameters among @p constants (Model::constants_at), or the law's own if
@@ -212,6 +298,9 @@ class TissueLawOf final : public TissueLaw {
 public:
   using Kernels = TissueKernels<Law>;
   using Parameters = typename Law::Parameters;
+
+  TissueLawOf() = default;
+  explicit TissueLawOf(const Parameters &parameters) : parameters_(parameters) {}
 
   const char *name() const override { return Law::name; }
   const char *alias() const override { return Law::alias; }
@@ -234,6 +323,11 @@ public:
             [](const PointState &s, const PetscScalar c[], PetscScalar A[81]) {
               Kernels::tangent(bare(s), constants::get<Parameters>(c), A);
             }};
+  }
+  std::unique_ptr<TissueLaw> energy_alone() const override
+  {
+    using Alone = std::conditional_t<has_derivatives<Law>, EnergyAlone<Law>, Law>;
+    return std::make_unique<TissueLawOf<Alone>>(parameters_);
   }
   PetscScalar energy(const PointState &state) const override { return Kernels::energy(state, parameters_); }
   using TissueLaw::stress;

@@ -1,13 +1,22 @@
 /// @file
 /// Manufactured solutions and what drives them: stress, body force, flux and mass source, by nested automatic
-/// differentiation (dual.hpp) of three things only: the displacement u(x, t), the pressure p(x, t) and the energy W of
-/// Table 1 (Aviles-Rojas & Hurtado 2022) as a function of the invariants. None of pulmo's own kinematics, stress or
-/// flux is used. Exact to rounding (checked in mms.cpp against the closed forms of free inflation and by differences).
+/// differentiation (pulmo/physics/dual.hpp) of three things only: the displacement u(x, t), the pressure p(x, t) and
+/// the energy W of Table 1 (Aviles-Rojas & Hurtado 2022) as a function of the invariants. None of pulmo's own
+/// kinematics, stress or flux is used. Exact to rounding (checked in mms.cpp against the closed forms of free inflation
+/// and by differences).
 #pragma once
 
-#include "verification/mms/dual.hpp"
+#include "pulmo/physics/dual.hpp"
 
 namespace mms {
+
+using pulmo::cos;
+using pulmo::Dual;
+using pulmo::exp;
+using pulmo::log;
+using pulmo::pow;
+using pulmo::seed;
+using pulmo::sin;
 
 /// Energies, kPa; I3 = J^2. `gas` scales the manufactured pressure to the stiffness of the law: with a gas pressure as
 /// large as the shear modulus and dead loads the exact solution is no stable equilibrium.

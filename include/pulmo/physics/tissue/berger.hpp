@@ -31,11 +31,17 @@ struct Berger {
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
-  static EnergyDerivatives energy(const Invariants &inv, const Parameters &k)
+  template <class T>
+  static T W(const Invariants<T> &inv, const Parameters &k)
+  {
+    const PetscScalar m = k.mu + k.lambda / 2;
+    return k.mu / 2 * inv.I1_minus_3 + k.lambda / 4 * inv.J_minus_1 * (inv.J + 1) - m * log(inv.J_minus_1 + k.phi0);
+  }
+
+  static EnergyDerivatives derivatives(const Invariants<> &inv, const Parameters &k)
   {
     const PetscScalar porosity = inv.J_minus_1 + k.phi0, m = k.mu + k.lambda / 2;
     EnergyDerivatives e;
-    e.W = k.mu / 2 * inv.I1_minus_3 + k.lambda / 4 * inv.J_minus_1 * (inv.J + 1) - m * std::log(porosity);
     e.W1 = k.mu / 2;
     e.WJ = k.lambda / 2 * inv.J - m / porosity;
     e.WJJ = k.lambda / 2 + m / (porosity * porosity);

@@ -41,7 +41,15 @@ struct Birzle {
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
-  static EnergyDerivatives energy(const Invariants &inv, const Parameters &k)
+  template <class T>
+  static T W(const Invariants<T> &inv, const Parameters &k)
+  {
+    const int d1 = static_cast<int>(k.d1), d3 = static_cast<int>(k.d3);
+    return k.c * inv.I1_minus_3 + k.c / k.beta * inv.power_of_I3_minus_1(-k.beta) +
+           k.c1 * whole_power(inv.isochoric_I1_minus_3(), d1) + k.c3 * whole_power(inv.power_of_I3_minus_1(1. / 3), d3);
+  }
+
+  static EnergyDerivatives derivatives(const Invariants<> &inv, const Parameters &k)
   {
     const int d1 = static_cast<int>(k.d1), d3 = static_cast<int>(k.d3);
     const PetscScalar l = inv.log_J(), y = std::expm1(2 * l / 3); // y = I3^1/3 - 1
@@ -56,7 +64,6 @@ struct Birzle {
     const PetscScalar Gy = d3 * gy * y, Gyy = d3 * (d3 - 1) * gy;
 
     EnergyDerivatives e;
-    e.W = k.c * inv.I1_minus_3 + k.c / k.beta * u_m1 + gx * x * x + gy * y * y;
     e.W1 = k.c + Gx * s;
     e.WJ = -2 * k.c * (u_m1 + 1) * r + Gx * x_J + Gy * y_J;
     e.W11 = Gxx * s * s;

@@ -29,17 +29,22 @@ struct Ma {
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
-  static EnergyDerivatives energy(const Invariants &inv, const Parameters &k)
+  template <class T>
+  static T W(const Invariants<T> &inv, const Parameters &k)
   {
-    const PetscScalar e1 = inv.I1_minus_3, e2 = inv.I2_minus_3;
-    const PetscScalar Q1 = k.a / 2 * e1 - k.b / 2, Q2 = k.b / 4;
+    const T e1 = inv.I1_minus_3, e2 = inv.I2_minus_3;
+    return k.c * exp(k.a / 4 * e1 * e1 + k.b * (e2 / 4 - e1 / 2));
+  }
+
+  static EnergyDerivatives derivatives(const Invariants<> &inv, const Parameters &k)
+  {
+    const PetscScalar E = W(inv, k), Q1 = k.a / 2 * inv.I1_minus_3 - k.b / 2, Q2 = k.b / 4;
     EnergyDerivatives e;
-    e.W = k.c * std::exp(k.a / 4 * e1 * e1 + k.b * (e2 / 4 - e1 / 2));
-    e.W1 = e.W * Q1;
-    e.W2 = e.W * Q2;
-    e.W11 = e.W * (Q1 * Q1 + k.a / 2);
-    e.W12 = e.W * Q1 * Q2;
-    e.W22 = e.W * Q2 * Q2;
+    e.W1 = E * Q1;
+    e.W2 = E * Q2;
+    e.W11 = E * (Q1 * Q1 + k.a / 2);
+    e.W12 = E * Q1 * Q2;
+    e.W22 = E * Q2 * Q2;
     return e;
   }
 };

@@ -30,7 +30,14 @@ struct Rausch {
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
-  static EnergyDerivatives energy(const Invariants &inv, const Parameters &k)
+  template <class T>
+  static T W(const Invariants<T> &inv, const Parameters &k)
+  {
+    const T x = inv.isochoric_I1_minus_3();
+    return x * x * (k.c_q + k.c_c * x) + k.kappa / 4 * (inv.J_minus_1 * (inv.J + 1) - 2 * inv.log_J());
+  }
+
+  static EnergyDerivatives derivatives(const Invariants<> &inv, const Parameters &k)
   {
     const PetscScalar l = inv.log_J(), y = std::expm1(2 * l / 3); // J^2/3 - 1
     const PetscScalar s = 1 / (1 + y), r = 1 / inv.J;
@@ -39,7 +46,6 @@ struct Rausch {
     const PetscScalar G = x * (2 * k.c_q + 3 * k.c_c * x), GG = 2 * k.c_q + 6 * k.c_c * x;
 
     EnergyDerivatives e;
-    e.W = x * x * (k.c_q + k.c_c * x) + k.kappa / 4 * (inv.J_minus_1 * (inv.J + 1) - 2 * l);
     e.W1 = G * s;
     e.WJ = G * x_J + k.kappa / 2 * inv.J_minus_1 * (inv.J + 1) * r;
     e.W11 = GG * s * s;

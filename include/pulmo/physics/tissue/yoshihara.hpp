@@ -28,11 +28,16 @@ struct Yoshihara {
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
-  static EnergyDerivatives energy(const Invariants &inv, const Parameters &k)
+  template <class T>
+  static T W(const Invariants<T> &inv, const Parameters &k)
+  {
+    return k.c * inv.I1_minus_3 + k.c / k.beta * inv.power_of_I3_minus_1(-k.beta);
+  }
+
+  static EnergyDerivatives derivatives(const Invariants<> &inv, const Parameters &k)
   {
     const PetscScalar u_m1 = std::expm1(-2 * k.beta * inv.log_J()), r = 1 / inv.J;
     EnergyDerivatives e;
-    e.W = k.c * inv.I1_minus_3 + k.c / k.beta * u_m1;
     e.W1 = k.c;
     e.WJ = -2 * k.c * (u_m1 + 1) * r;
     e.WJJ = 2 * k.c * (2 * k.beta + 1) * (u_m1 + 1) * r * r;

@@ -1,11 +1,12 @@
 /// @file
-/// Forward automatic differentiation: a number with N derivatives, nestable. The manufactured sources come from it.
+/// Dual numbers: a number with its derivatives by N variables, nestable for second derivatives. Tissue laws that give
+/// no more than W get their derivatives from them.
 #pragma once
 
 #include <array>
 #include <cmath>
 
-namespace mms {
+namespace pulmo {
 
 template <class T, int N>
 struct Dual {
@@ -16,6 +17,7 @@ struct Dual {
   Dual(double value) : v(value) {}
 
   Dual &operator+=(const Dual &b) { return *this = *this + b; }
+  Dual &operator*=(const Dual &b) { return *this = *this * b; }
   friend Dual operator-(const Dual &a) { return a * -1.0; }
   friend Dual operator+(const Dual &a, const Dual &b)
   {
@@ -53,6 +55,13 @@ struct Dual {
     return r;
   }
   friend Dual operator*(double a, const Dual &b) { return b * a; }
+  friend Dual operator/(const Dual &a, double b)
+  {
+    Dual r;
+    r.v = a.v / b;
+    for (int i = 0; i < N; ++i) r.d[i] = a.d[i] / b;
+    return r;
+  }
   friend Dual operator+(const Dual &a, double b)
   {
     Dual r = a;
@@ -83,11 +92,15 @@ void seed(const T value[], Dual<T, N> (&variable)[N])
   }
 }
 
+// so that a formula reads the same for plain numbers
 using std::cos;
 using std::exp;
+using std::expm1;
 using std::log;
+using std::log1p;
 using std::pow;
 using std::sin;
+using std::sqrt;
 
 template <class T, int N>
 Dual<T, N> sin(const Dual<T, N> &a)
@@ -110,10 +123,29 @@ Dual<T, N> log(const Dual<T, N> &a)
 {
   return chain(a, T(log(a.v)), T(T(1.0) / a.v));
 }
+/// exp(a) - 1, accurate near a = 0.
+template <class T, int N>
+Dual<T, N> expm1(const Dual<T, N> &a)
+{
+  const T e = expm1(a.v);
+  return chain(a, e, T(e + 1.0));
+}
+/// log(1 + a), accurate near a = 0.
+template <class T, int N>
+Dual<T, N> log1p(const Dual<T, N> &a)
+{
+  return chain(a, T(log1p(a.v)), T(T(1.0) / (a.v + 1.0)));
+}
+template <class T, int N>
+Dual<T, N> sqrt(const Dual<T, N> &a)
+{
+  const T root = sqrt(a.v);
+  return chain(a, root, T(T(0.5) / root));
+}
 template <class T, int N>
 Dual<T, N> pow(const Dual<T, N> &a, double n)
 {
-  return chain(a, T(pow(a.v, n)), T(pow(a.v, n - 1) * n));
+  return chain(a, T(pow(a.v, n)), n == 0 ? T(0.0) : T(pow(a.v, n - 1) * n));
 }
 
-} // namespace mms
+} // namespace pulmo
