@@ -21,28 +21,9 @@ struct Assembly::Facets {
   ~Facets() { (void)PetscFEGeomDestroy(&geom); }
 };
 
-/// Where the entries of element matrices go in a sparse matrix. Dofs of one mesh point are neighbours in every
-/// row, and all rows of a mesh point have the same pattern: one offset per pair of mesh points of a cell is enough.
-struct Assembly::MatrixMap {
-  PetscObjectId matrix = 0; ///< which matrix: an address may be used again
-  bool direct = false;      ///< AIJ: entries are added in place
-  Mat diagonal = nullptr, off_diagonal = nullptr;
-  const PetscInt *row_begin[2] = {nullptr, nullptr}; ///< CSR row pointers of the two parts
-  PetscScalar *values[2] = {nullptr, nullptr};       ///< their entries, while a Jacobian is assembled
-  std::vector<std::int32_t> offset;                  ///< [cell][row point][column point]
-  std::vector<PetscInt> global;                      ///< [local dof]: global number of a free dof, -1 if constrained
-  std::vector<PetscInt> row;                         ///< [local dof]: owned: local row; ghost: -(ghost row) - 1
-  std::vector<std::int8_t> free_index; ///< [local dof]: place among the free dofs of its mesh point, -1 constrained
-  std::vector<std::uint8_t> owned;     ///< [mesh point]
-  // rows of other ranks, summed here and sent once
-  std::vector<PetscInt> ghost_begin, ghost_columns, ghost_rows;
-  std::vector<PetscScalar> ghost_values;
-};
-
 Assembly::~Assembly()
 {
   for (Facets *f : facets_) delete f;
-  delete map_;
 }
 
 PetscErrorCode Assembly::setup(DM dm, PetscDS rate_ds, const ParameterFields *varying)
@@ -72,7 +53,7 @@ PetscErrorCode Assembly::setup_varying(const ParameterFields &fields)
 {
   PetscFunctionBeginUser;
   places_.offsets = fields.offsets();
-  for (PetscInt c = 0; c < cells_; ++c) fields.append(c, "", cell_constants_);
+  for (PetscInt c = 0; c < layout_.cells; ++c) fields.append(c, "", cell_constants_);
   for (Facets *facets : facets_) {
     const char *surface;
     PetscCall(PetscObjectGetName((PetscObject)facets->key.label, &surface));
@@ -90,14 +71,14 @@ PetscErrorCode Assembly::setup_cells()
   PetscFunctionBeginUser;
   PetscCall(DMGetLocalSection(dm_, &section));
   PetscCall(DMPlexGetHeightStratum(dm_, 0, &first_cell_, &last));
-  cells_ = last - first_cell_;
-  PetscCall(PetscDSGetTotalDimension(ds_, &element_size_));
-  cell_dofs_.resize(static_cast<std::size_t>(cells_ * element_size_));
-  v0_.resize(3 * cells_);
-  J_.resize(9 * cells_);
-  invJ_.resize(9 * cells_);
-  detJ_.resize(cells_);
-  for (PetscInt c = 0; c < cells_; ++c) {
+  layout_.cells = last - first_cell_;
+  PetscCall(PetscDSGetTotalDimension(ds_, &layout_.size));
+  layout_.dofs.resize(static_cast<std::size_t>(layout_.cells * layout_.size));
+  v0_.resize(3 * layout_.cells);
+  J_.resize(9 * layout_.cells);
+  invJ_.resize(9 * layout_.cells);
+  detJ_.resize(layout_.cells);
+  for (PetscInt c = 0; c < layout_.cells; ++c) {
     PetscInt *closure = nullptr, n_closure, n = 0;
     std::vector<PetscInt> points;
     const PetscInt **place_of; // [mesh point][dof]: its place as the cell sees it; null: as it is
@@ -114,12 +95,12 @@ PetscErrorCode Assembly::setup_cells()
         if (dof == 0) continue;
         auto place = std::find(points.begin(), points.end(), point);
         if (place == points.end()) place = points.insert(points.end(), point);
-        PetscCheck(n + dof <= element_size_, PETSC_COMM_SELF, PETSC_ERR_PLIB, "closure larger than the element");
+        PetscCheck(n + dof <= layout_.size, PETSC_COMM_SELF, PETSC_ERR_PLIB, "closure larger than the element");
         for (PetscInt d = 0; d < dof; ++d) {
-          cell_dofs_[c * element_size_ + n + (place_of && place_of[i] ? place_of[i][d] : d)] = offset + d;
+          layout_.dofs[c * layout_.size + n + (place_of && place_of[i] ? place_of[i][d] : d)] = offset + d;
           if (c == 0) {
-            dof_point_.push_back(static_cast<PetscInt>(place - points.begin()));
-            dof_field_.push_back(f);
+            layout_.point_of.push_back(static_cast<PetscInt>(place - points.begin()));
+            layout_.field_of.push_back(f);
           }
         }
         n += dof;
@@ -127,9 +108,9 @@ PetscErrorCode Assembly::setup_cells()
       PetscCall(PetscSectionRestoreFieldPointSyms(section, f, n_closure, closure, &place_of, nullptr));
     }
     PetscCall(DMPlexRestoreTransitiveClosure(dm_, first_cell_ + c, PETSC_TRUE, &n_closure, &closure));
-    PetscCheck(n == element_size_, PETSC_COMM_SELF, PETSC_ERR_PLIB, "closure smaller than the element");
-    points_per_cell_ = static_cast<PetscInt>(points.size());
-    cell_points_.insert(cell_points_.end(), points.begin(), points.end());
+    PetscCheck(n == layout_.size, PETSC_COMM_SELF, PETSC_ERR_PLIB, "closure smaller than the element");
+    layout_.points = static_cast<PetscInt>(points.size());
+    layout_.of_cell.insert(layout_.of_cell.end(), points.begin(), points.end());
   }
 
   // where J is watched: the quadrature points, then the corners of the reference cell
@@ -259,7 +240,7 @@ template <class OnCells, class OnFacets, class Scatter>
 PetscErrorCode Assembly::for_blocks(Part part, Vec x, Vec x_t, PetscInt result_size, OnCells &&on_cells,
                                     OnFacets &&on_facets, Scatter &&scatter)
 {
-  const std::size_t n_coefficients = static_cast<std::size_t>(block_cells * element_size_);
+  const std::size_t n_coefficients = static_cast<std::size_t>(block_cells * layout_.size);
   std::vector<PetscScalar> u(n_coefficients), u_t(n_coefficients);
   std::vector<PetscScalar> results(static_cast<std::size_t>(block_cells * result_size));
 
@@ -267,12 +248,12 @@ PetscErrorCode Assembly::for_blocks(Part part, Vec x, Vec x_t, PetscInt result_s
   const ReadArray xs(x), xts(x_t);
   const auto gather = [&](PetscInt i, PetscInt cell) {
     const PetscInt *dofs = cell_dofs(cell);
-    for (PetscInt k = 0; k < element_size_; ++k) {
-      u[i * element_size_ + k] = xs[dofs[k]];
-      u_t[i * element_size_ + k] = xts[dofs[k]];
+    for (PetscInt k = 0; k < layout_.size; ++k) {
+      u[i * layout_.size + k] = xs[dofs[k]];
+      u_t[i * layout_.size + k] = xts[dofs[k]];
     }
   };
-  const PetscInt n_cells = part == Part::all ? cells_ : 0, most = places_per_call();
+  const PetscInt n_cells = part == Part::all ? layout_.cells : 0, most = places_per_call();
   for (PetscInt begin = 0, block = 0; begin < n_cells; begin += most, ++block) {
     const PetscInt n = std::min(most, n_cells - begin);
     PetscFEGeom geom = block_geometry(begin, n);
@@ -347,10 +328,10 @@ PetscErrorCode Assembly::residual(Part part, PetscReal t, Vec x, Vec x_t, const 
   };
   const auto scatter = [&](PetscInt cell, const PetscScalar *vector) -> PetscErrorCode {
     const PetscInt *dofs = cell_dofs(cell);
-    for (PetscInt i = 0; i < element_size_; ++i) f[dofs[i]] += row_scale[dof_field_[i]] * vector[i];
+    for (PetscInt i = 0; i < layout_.size; ++i) f[dofs[i]] += row_scale[layout_.field_of[i]] * vector[i];
     return PETSC_SUCCESS;
   };
-  PetscCall(for_blocks(part, x, x_t, element_size_, on_cells, on_facets, scatter));
+  PetscCall(for_blocks(part, x, x_t, layout_.size, on_cells, on_facets, scatter));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -358,11 +339,9 @@ PetscErrorCode Assembly::jacobian(Part part, PetscReal t, Vec x, Vec x_t, PetscR
                                   Mat A, CellMatrices *also)
 {
   PetscFunctionBeginUser;
-  PetscCall(map_matrix(A));
+  PetscCall(map_.setup(dm_, layout_, A));
   if (part == Part::all) PetscCall(MatZeroEntries(A));
-  std::fill(map_->ghost_values.begin(), map_->ghost_values.end(), 0.0);
-  if (map_->diagonal) PetscCall(MatSeqAIJGetArray(map_->diagonal, &map_->values[0]));
-  if (map_->off_diagonal) PetscCall(MatSeqAIJGetArray(map_->off_diagonal, &map_->values[1]));
+  PetscCall(map_.begin());
   const auto on_cells = [&](PetscInt n, PetscFEGeom *geom, const PetscScalar *u, const PetscScalar *u_t,
                             PetscScalar *matrices) -> PetscErrorCode {
     PetscFunctionBeginUser;
@@ -371,7 +350,7 @@ PetscErrorCode Assembly::jacobian(Part part, PetscReal t, Vec x, Vec x_t, PetscR
                                            rate_ds_, t, shift, matrices));
     const auto begin = static_cast<PetscInt>((geom->detJ - detJ_.data()));
     for (PetscInt i = 0; also && i < n; ++i)
-      PetscCall(also->add(begin + i, matrices + i * element_size_ * element_size_, row_scale));
+      PetscCall(also->add(begin + i, matrices + i * layout_.size * layout_.size, row_scale));
     PetscFunctionReturn(PETSC_SUCCESS);
   };
   const auto on_facets = [&](const Facets &facets, PetscInt n, PetscFEGeom *geom, const PetscScalar *u,
@@ -385,319 +364,9 @@ PetscErrorCode Assembly::jacobian(Part part, PetscReal t, Vec x, Vec x_t, PetscR
     }
     PetscFunctionReturn(PETSC_SUCCESS);
   };
-  const auto scatter = [&](PetscInt cell, const PetscScalar *matrix) {
-    return add_to_matrix(cell, matrix, row_scale, A);
-  };
-  PetscCall(for_blocks(part, x, x_t, element_size_ * element_size_, on_cells, on_facets, scatter));
-  if (map_->diagonal) PetscCall(MatSeqAIJRestoreArray(map_->diagonal, &map_->values[0]));
-  if (map_->off_diagonal) PetscCall(MatSeqAIJRestoreArray(map_->off_diagonal, &map_->values[1]));
-  for (std::size_t r = 0; r < map_->ghost_rows.size(); ++r) {
-    const PetscInt n = map_->ghost_begin[r + 1] - map_->ghost_begin[r];
-    PetscCall(MatSetValues(A, 1, &map_->ghost_rows[r], n, &map_->ghost_columns[map_->ghost_begin[r]],
-                           &map_->ghost_values[map_->ghost_begin[r]], ADD_VALUES));
-  }
-  PetscCall(MatAssemblyBegin(A, MAT_FINAL_ASSEMBLY));
-  PetscCall(MatAssemblyEnd(A, MAT_FINAL_ASSEMBLY));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode Assembly::map_matrix(Mat A)
-{
-  PetscObjectId id;
-  PetscSection section, global;
-  PetscInt point_begin, point_end, n_local, row_begin, row_end;
-  PetscBool seq, mpi;
-  const PetscInt *garray = nullptr, *columns[2] = {nullptr, nullptr};
-  PetscInt n_garray = 0;
-
-  PetscFunctionBeginUser;
-  PetscCall(PetscObjectGetId((PetscObject)A, &id));
-  if (map_ && map_->matrix == id) PetscFunctionReturn(PETSC_SUCCESS);
-  delete map_;
-  map_ = new MatrixMap;
-  MatrixMap &m = *map_;
-  m.matrix = id;
-  PetscCall(DMGetLocalSection(dm_, &section));
-  PetscCall(DMGetGlobalSection(dm_, &global));
-  PetscCall(PetscSectionGetChart(section, &point_begin, &point_end));
-  PetscCall(PetscSectionGetStorageSize(section, &n_local));
-  PetscCall(MatGetOwnershipRange(A, &row_begin, &row_end));
-  PetscCall(PetscObjectTypeCompare((PetscObject)A, MATSEQAIJ, &seq));
-  PetscCall(PetscObjectTypeCompare((PetscObject)A, MATMPIAIJ, &mpi));
-  m.direct = seq || mpi;
-
-  // free dofs and their global numbers
-  m.global.assign(n_local, -1);
-  m.row.assign(n_local, 0);
-  m.free_index.assign(n_local, -1);
-  m.owned.assign(point_end, 0);
-  std::vector<PetscInt> first_free(point_end, 0), n_free(point_end, 0); // global number of the first, count
-  for (PetscInt p = point_begin; p < point_end; ++p) {
-    PetscInt dof, offset, constrained, first, k = 0;
-    const PetscInt *which = nullptr;
-    PetscCall(PetscSectionGetDof(section, p, &dof));
-    if (dof == 0) continue;
-    PetscCall(PetscSectionGetOffset(section, p, &offset));
-    PetscCall(PetscSectionGetConstraintDof(section, p, &constrained));
-    if (constrained) PetscCall(PetscSectionGetConstraintIndices(section, p, &which));
-    PetscCall(PetscSectionGetOffset(global, p, &first));
-    m.owned[p] = first >= 0;
-    if (first < 0) first = -(first + 1);
-    first_free[p] = first;
-    for (PetscInt d = 0; d < dof; ++d) {
-      if (std::find(which, which + constrained, d) != which + constrained) continue;
-      m.free_index[offset + d] = static_cast<std::int8_t>(k);
-      m.global[offset + d] = first + k;
-      m.row[offset + d] = first + k - row_begin;
-      ++k;
-    }
-    n_free[p] = k;
-  }
-  if (!m.direct) PetscFunctionReturn(PETSC_SUCCESS);
-
-  m.diagonal = A;
-  if (mpi) {
-    PetscCall(MatMPIAIJGetSeqAIJ(A, &m.diagonal, &m.off_diagonal, &garray));
-    PetscCall(MatGetSize(m.off_diagonal, nullptr, &n_garray));
-  }
-  PetscInt n_rows;
-  PetscBool done;
-  PetscCall(MatGetRowIJ(m.diagonal, 0, PETSC_FALSE, PETSC_FALSE, &n_rows, &m.row_begin[0], &columns[0], &done));
-  if (mpi)
-    PetscCall(MatGetRowIJ(m.off_diagonal, 0, PETSC_FALSE, PETSC_FALSE, &n_rows, &m.row_begin[1], &columns[1], &done));
-
-  // ghost rows: their columns are the free dofs of all mesh points that share a cell with them
-  std::map<PetscInt, std::map<PetscInt, std::int32_t>> ghosts; // row point -> column point -> offset in the row
-  for (PetscInt c = 0; c < cells_; ++c) {
-    const PetscInt *points = &cell_points_[c * points_per_cell_];
-    for (PetscInt i = 0; i < points_per_cell_; ++i)
-      if (!m.owned[points[i]])
-        for (PetscInt j = 0; j < points_per_cell_; ++j) ghosts[points[i]][points[j]] = 0;
-  }
-  m.ghost_begin.push_back(0);
-  for (auto &[point, row] : ghosts) {
-    PetscInt offset, dof, length = 0;
-    std::vector<PetscInt> row_columns;
-    for (auto &[column, place] : row) {
-      place = static_cast<std::int32_t>(length);
-      for (PetscInt k = 0; k < n_free[column]; ++k) row_columns.push_back(first_free[column] + k);
-      length += n_free[column];
-    }
-    PetscCall(PetscSectionGetOffset(section, point, &offset));
-    PetscCall(PetscSectionGetDof(section, point, &dof));
-    for (PetscInt d = 0; d < dof; ++d) {
-      if (m.free_index[offset + d] < 0) continue;
-      m.row[offset + d] = -static_cast<PetscInt>(m.ghost_rows.size()) - 1;
-      m.ghost_rows.push_back(m.global[offset + d]);
-      m.ghost_columns.insert(m.ghost_columns.end(), row_columns.begin(), row_columns.end());
-      m.ghost_begin.push_back(static_cast<PetscInt>(m.ghost_columns.size()));
-    }
-  }
-  m.ghost_values.assign(m.ghost_columns.size(), 0);
-
-  // offsets of column points within the rows of row points
-  m.offset.resize(static_cast<std::size_t>(cells_) * points_per_cell_ * points_per_cell_);
-  for (PetscInt c = 0; c < cells_; ++c) {
-    const PetscInt *points = &cell_points_[c * points_per_cell_];
-    for (PetscInt i = 0; i < points_per_cell_; ++i) {
-      for (PetscInt j = 0; j < points_per_cell_; ++j) {
-        std::int32_t &offset = m.offset[(c * points_per_cell_ + i) * points_per_cell_ + j];
-        offset = 0;
-        if (n_free[points[i]] == 0 || n_free[points[j]] == 0) continue;
-        if (!m.owned[points[i]]) {
-          offset = ghosts[points[i]][points[j]];
-          continue;
-        }
-        const int part = m.owned[points[j]] ? 0 : 1;
-        PetscInt column = first_free[points[j]];
-        if (part == 0)
-          column -= row_begin;
-        else {
-          const PetscInt *place = std::lower_bound(garray, garray + n_garray, column);
-          PetscCheck(place < garray + n_garray && *place == column, PETSC_COMM_SELF, PETSC_ERR_PLIB,
-                     "the matrix lacks a column of a neighbouring rank");
-          column = static_cast<PetscInt>(place - garray);
-        }
-        const PetscInt row = first_free[points[i]] - row_begin;
-        const PetscInt *begin = columns[part] + m.row_begin[part][row],
-                       *end = columns[part] + m.row_begin[part][row + 1];
-        const PetscInt *place = std::lower_bound(begin, end, column);
-        PetscCheck(place < end && *place == column, PETSC_COMM_SELF, PETSC_ERR_PLIB,
-                   "the matrix pattern lacks an entry of the element matrices");
-        offset = static_cast<std::int32_t>(place - begin);
-      }
-    }
-  }
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode Assembly::add_to_matrix(PetscInt cell, const PetscScalar *matrix, const PetscReal row_scale[], Mat A)
-{
-  constexpr PetscInt max_size = 128;
-  MatrixMap &m = *map_;
-  const PetscInt *dofs = cell_dofs(cell), *points = &cell_points_[cell * points_per_cell_];
-
-  PetscFunctionBeginHot;
-  PetscCheck(element_size_ <= max_size, PETSC_COMM_SELF, PETSC_ERR_SUP, "elements with more than %d dofs",
-             (int)max_size);
-  if (!m.direct) {
-    PetscScalar scaled[max_size];
-    PetscInt columns[max_size];
-    for (PetscInt i = 0; i < element_size_; ++i) columns[i] = m.global[dofs[i]];
-    for (PetscInt i = 0; i < element_size_; ++i) {
-      for (PetscInt j = 0; j < element_size_; ++j) scaled[j] = row_scale[dof_field_[i]] * matrix[i * element_size_ + j];
-      PetscCall(MatSetValues(A, 1, &columns[i], element_size_, columns, scaled, ADD_VALUES));
-    }
-    PetscFunctionReturn(PETSC_SUCCESS);
-  }
-
-  // free columns, first those of this rank, then the others
-  PetscInt columns[max_size], n_columns[2] = {0, 0};
-  for (int part = 0, n = 0; part < 2; ++part) {
-    for (PetscInt j = 0; j < element_size_; ++j)
-      if (m.free_index[dofs[j]] >= 0 && (m.owned[points[dof_point_[j]]] ? 0 : 1) == part) columns[n++] = j;
-    n_columns[part] = n;
-  }
-  PetscInt place[max_size], current = -1;
-  for (PetscInt i = 0; i < element_size_; ++i) {
-    if (m.free_index[dofs[i]] < 0) continue;
-    const PetscInt point = dof_point_[i];
-    if (point != current) {
-      const std::int32_t *offset = &m.offset[(cell * points_per_cell_ + point) * points_per_cell_];
-      for (PetscInt k = 0; k < n_columns[1]; ++k) {
-        const PetscInt j = columns[k];
-        place[k] = offset[dof_point_[j]] + m.free_index[dofs[j]];
-      }
-      current = point;
-    }
-    const PetscScalar *entries = matrix + i * element_size_, scale = row_scale[dof_field_[i]];
-    const PetscInt row = m.row[dofs[i]];
-    if (row < 0) {
-      PetscScalar *target = &m.ghost_values[m.ghost_begin[-row - 1]];
-      for (PetscInt k = 0; k < n_columns[1]; ++k) target[place[k]] += scale * entries[columns[k]];
-    } else {
-      PetscScalar *target = m.values[0] + m.row_begin[0][row];
-      for (PetscInt k = 0; k < n_columns[0]; ++k) target[place[k]] += scale * entries[columns[k]];
-      if (n_columns[1] > n_columns[0]) {
-        target = m.values[1] + m.row_begin[1][row];
-        for (PetscInt k = n_columns[0]; k < n_columns[1]; ++k) target[place[k]] += scale * entries[columns[k]];
-      }
-    }
-  }
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-/// Displacements of the nodes of a cell; the fourth entry is zero.
-struct NodeDisplacements {
-  Vector4 of[max_nodes];
-  Vector4 &operator[](PetscInt a) { return of[a]; }
-  const Vector4 &operator[](PetscInt a) const { return of[a]; }
-};
-
-static void gather_displacements(const PetscInt *dofs, PetscInt nodes, const PetscScalar *x, NodeDisplacements &u)
-{
-  for (PetscInt a = 0; a < nodes; ++a) u[a] = Vector4{x[dofs[3 * a]], x[dofs[3 * a + 1]], x[dofs[3 * a + 2]], 0};
-}
-
-/// Grad u at a sample point, with @p D the derivatives of the basis there, from the cell's displacements.
-static void sample_gradient(const PetscReal *D, const PetscReal *inverse, PetscInt nodes, const NodeDisplacements &u,
-                            PetscScalar H[9])
-{
-  Vector4 along[3] = {}; // the axes of the reference cell
-  for (PetscInt a = 0; a < nodes; ++a)
-    for (int g = 0; g < 3; ++g) along[g] += D[3 * a + g] * u[a];
-  for (int d = 0; d < 3; ++d) {
-    const Vector4 h = along[0] * inverse[d] + along[1] * inverse[3 + d] + along[2] * inverse[6 + d];
-    for (int i = 0; i < 3; ++i) H[3 * i + d] = h[i];
-  }
-}
-
-void Assembly::point_states(PetscInt c, const PetscScalar *x, std::vector<PointState> &states) const
-{
-  NodeDisplacements u;
-  states.resize(sample_points_);
-  gather_displacements(cell_dofs(c), nodes_, x, u);
-  for (PetscInt q = 0; q < sample_points_; ++q) {
-    PetscScalar H[9];
-    sample_gradient(&sample_gradients_[q * nodes_ * 3], &invJ_[9 * c], nodes_, u, H);
-    make_point_state(H, nullptr, states[q]);
-  }
-}
-
-PetscErrorCode Assembly::measure(Vec x, Measures &measures) const
-{
-  const MPI_Comm comm = PetscObjectComm((PetscObject)dm_);
-  const auto n_rule = static_cast<PetscInt>(sample_weights_.size());
-  struct {
-    double value;
-    int rank;
-  } least{PETSC_MAX_REAL, 0}, winner;
-  double volume = 0, extremes[2] = {-PETSC_MAX_REAL, -PETSC_MAX_REAL}; // max J, -(min J at points)
-  PetscInt where = -1;
-
-  PetscFunctionBeginUser;
-  PetscCallMPI(MPI_Comm_rank(comm, &least.rank));
-  const ReadArray xs(x);
-  for (PetscInt c = 0; c < cells_; ++c) {
-    NodeDisplacements u;
-    gather_displacements(cell_dofs(c), nodes_, xs.data(), u);
-    double sum = 0;
-    for (PetscInt q = 0; q < sample_points_; ++q) {
-      PetscScalar H[9];
-      sample_gradient(&sample_gradients_[q * nodes_ * 3], &invJ_[9 * c], nodes_, u, H);
-      const double Jm1 = jacobian_minus_one(H), J = 1 + Jm1;
-      extremes[0] = std::max(extremes[0], J);
-      if (q < n_rule) {
-        sum += sample_weights_[q] * Jm1;
-        extremes[1] = std::max(extremes[1], std::isnan(J) ? PETSC_MAX_REAL : -J);
-      }
-      if (!(J >= least.value)) { // also taken when J is not a number
-        least.value = std::isnan(J) ? -PETSC_MAX_REAL : J;
-        where = c;
-      }
-    }
-    volume += sum * detJ_[c];
-  }
-  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &volume, 1, MPI_DOUBLE, MPI_SUM, comm));
-  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, extremes, 2, MPI_DOUBLE, MPI_MAX, comm));
-  PetscCallMPI(MPI_Allreduce(&least, &winner, 1, MPI_DOUBLE_INT, MPI_MINLOC, comm));
-  measures.volume_change = volume;
-  measures.max_J = extremes[0];
-  measures.min_J_points = -extremes[1];
-  measures.min_J = winner.value;
-  measures.rank = winner.rank;
-  measures.cell = where;
-  if (winner.rank == least.rank && where >= 0)
-    for (int d = 0; d < 3; ++d) // reference coordinates of the centroid are -1/2
-      measures.where[d] =
-          v0_[3 * where + d] + (J_[9 * where + 3 * d] + J_[9 * where + 3 * d + 1] + J_[9 * where + 3 * d + 2]) / 2;
-  PetscCallMPI(MPI_Bcast(measures.where, 3, MPIU_REAL, winner.rank, comm));
-  PetscCallMPI(MPI_Bcast(&measures.cell, 1, MPIU_INT, winner.rank, comm));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode Assembly::volume_derivative(Vec x, Vec y, PetscReal &derivative) const
-{
-  PetscFunctionBeginUser;
-  const ReadArray xs(x), ys(y);
-  derivative = 0;
-  for (PetscInt c = 0; c < cells_; ++c) {
-    NodeDisplacements u, v;
-    gather_displacements(cell_dofs(c), nodes_, xs.data(), u);
-    gather_displacements(cell_dofs(c), nodes_, ys.data(), v);
-    PetscReal sum = 0;
-    for (std::size_t q = 0; q < sample_weights_.size(); ++q) {
-      PetscScalar H[9], G[9], cof_F[9];
-      const PetscReal *gradients = &sample_gradients_[q * nodes_ * 3];
-      sample_gradient(gradients, &invJ_[9 * c], nodes_, u, H);
-      sample_gradient(gradients, &invJ_[9 * c], nodes_, v, G);
-      for (int i = 0; i < 3; ++i) H[4 * i] += 1;
-      cofactor(H, cof_F);
-      sum += sample_weights_[q] * contract(cof_F, G);
-    }
-    derivative += sum * detJ_[c];
-  }
-  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &derivative, 1, MPIU_REAL, MPI_SUM, PetscObjectComm((PetscObject)dm_)));
+  const auto scatter = [&](PetscInt cell, const PetscScalar *matrix) { return map_.add(cell, matrix, row_scale, A); };
+  PetscCall(for_blocks(part, x, x_t, layout_.size * layout_.size, on_cells, on_facets, scatter));
+  PetscCall(map_.end(A));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

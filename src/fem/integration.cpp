@@ -1,13 +1,9 @@
 #include "pulmo/fem/integration.hpp"
 
-#include "pulmo/base/simd.hpp"
-#include "pulmo/physics/point.hpp"
+#include "pulmo/fem/element_products.hpp"
 
-#include <algorithm>
 #include <petsc/private/petscfeimpl.h>
 
-#include <cstdlib>
-#include <new>
 #include <optional>
 #include <type_traits>
 
@@ -15,250 +11,9 @@ PETSC_EXTERN PetscErrorCode PetscFECreate_Basic(PetscFE);
 
 namespace pulmo {
 
+using namespace element;
+
 namespace {
-
-constexpr PetscInt dim = 3;
-constexpr PetscInt max_fields = 4;
-constexpr PetscInt max_components = 3;
-
-// ------------------------------------------------------------------------------------------------ small arrays
-
-/// Zeroed, 64-byte aligned scratch memory that lives for one block of cells.
-class Scratch {
-public:
-  explicit Scratch(std::size_t n)
-      : data_(static_cast<PetscScalar *>(std::aligned_alloc(64, (n * sizeof(PetscScalar) + 127) / 64 * 64)))
-  {
-    if (!data_) throw std::bad_alloc();
-    std::memset(data_, 0, n * sizeof(PetscScalar));
-  }
-  ~Scratch() { std::free(data_); }
-  Scratch(const Scratch &) = delete;
-  Scratch &operator=(const Scratch &) = delete;
-  PetscScalar *take(std::size_t n)
-  {
-    PetscScalar *p = data_ + used_;
-    used_ += (n + 7) / 8 * 8;
-    return p;
-  }
-  static std::size_t padded(std::size_t n) { return (n + 7) / 8 * 8; }
-
-private:
-  PetscScalar *data_;
-  std::size_t used_ = 0;
-};
-
-inline const Vector4 &four(const double *p)
-{
-  return *reinterpret_cast<const Vector4 *>(p);
-}
-inline Vector4 &four(double *p)
-{
-  return *reinterpret_cast<Vector4 *>(p);
-}
-
-/// out = s[0] G_0 + s[1] G_1 + s[2] G_2 for three rows of @p n doubles, one after the other; n is a multiple of 4.
-inline void combine(PetscInt n, const double s[3], const double *G, double *out)
-{
-  const double s0 = s[0], s1 = s[1], s2 = s[2];
-  for (PetscInt a = 0; a < n; a += 4)
-    four(out + a) = s0 * four(G + a) + s1 * four(G + n + a) + s2 * four(G + 2 * n + a);
-}
-
-/// K[a][b] += sum_r L[r][a] R[r][b]. Rows of L and R have strides @p lda and @p ldb, rows of K @p ldb.
-template <int Rows, int Vectors>
-inline void product_tile(PetscInt rank, const double *L, PetscInt lda, const double *R, PetscInt ldb, double *K)
-{
-  Vector4 sum[Rows][Vectors];
-  for (int a = 0; a < Rows; ++a)
-    for (int v = 0; v < Vectors; ++v) sum[a][v] = four(K + a * ldb + 4 * v);
-  for (PetscInt r = 0; r < rank; ++r) {
-    for (int a = 0; a < Rows; ++a) {
-      const double l = L[r * lda + a];
-      for (int v = 0; v < Vectors; ++v) sum[a][v] += l * four(R + r * ldb + 4 * v);
-    }
-  }
-  for (int a = 0; a < Rows; ++a)
-    for (int v = 0; v < Vectors; ++v) four(K + a * ldb + 4 * v) = sum[a][v];
-}
-
-/// The same for any number of rows; @p ldb is a multiple of 4.
-template <int Vectors>
-inline void product_rows(PetscInt rows, PetscInt rank, const double *L, PetscInt lda, const double *R, PetscInt ldb,
-                         double *K)
-{
-  PetscInt a = 0;
-  for (; a + 5 <= rows; a += 5) product_tile<5, Vectors>(rank, L + a, lda, R, ldb, K + a * ldb);
-  for (; a + 2 <= rows; a += 2) product_tile<2, Vectors>(rank, L + a, lda, R, ldb, K + a * ldb);
-  for (; a < rows; ++a) product_tile<1, Vectors>(rank, L + a, lda, R, ldb, K + a * ldb);
-}
-
-inline void product(PetscInt rows, PetscInt rank, const double *L, PetscInt lda, const double *R, PetscInt ldb,
-                    double *K)
-{
-  PetscInt b = 0;
-  for (; b + 12 <= ldb; b += 12) product_rows<3>(rows, rank, L, lda, R + b, ldb, K + b);
-  for (; b < ldb; b += 4) product_rows<1>(rows, rank, L, lda, R + b, ldb, K + b);
-}
-
-// ------------------------------------------------------------------------------------------------- tabulation
-
-/// One scalar component of a Lagrange basis at the points of a rule, rows padded to a multiple of 4.
-struct ScalarBasis {
-  PetscInt nodes = 0, components = 0, stride = 0, offset = 0; ///< offset: of the field in the element vector
-  const PetscScalar *values = nullptr;                        ///< [point][stride]
-  const PetscScalar *derivatives = nullptr;                   ///< [point][dim][stride], in the reference cell
-};
-
-/// The fields of a PetscDS at a rule.
-struct Fields {
-  PetscInt n = 0, points = 0, element_size = 0, total_components = 0;
-  PetscInt uOff[max_fields + 1], uOff_x[max_fields + 1]; ///< as PetscDS: where a field's values and gradients begin
-  ScalarBasis basis[max_fields];
-};
-
-std::size_t fields_scratch(PetscInt n, PetscTabulation *T, PetscInt replicas)
-{
-  std::size_t size = 0;
-  for (PetscInt f = 0; f < n; ++f)
-    size += 4 * Scratch::padded(static_cast<std::size_t>(replicas * T[f]->Np * (T[f]->Nb + 4)));
-  return size;
-}
-
-/// Copies one component of PETSc's tabulation. @p replica: the face of the reference cell, 0 for cells.
-PetscErrorCode make_fields(PetscDS ds, PetscTabulation *T, PetscInt replica, Scratch &scratch, Fields &fields)
-{
-  PetscFunctionBeginUser;
-  PetscCall(PetscDSGetNumFields(ds, &fields.n));
-  PetscCheck(fields.n <= max_fields, PETSC_COMM_SELF, PETSC_ERR_SUP, "more than %d fields", (int)max_fields);
-  fields.points = T[0]->Np;
-  fields.uOff[0] = fields.uOff_x[0] = fields.element_size = 0;
-  for (PetscInt f = 0; f < fields.n; ++f) {
-    ScalarBasis &basis = fields.basis[f];
-    const PetscInt Nc = T[f]->Nc, Nb = T[f]->Nb, Np = T[f]->Np;
-    PetscCheck(Np == fields.points, PETSC_COMM_SELF, PETSC_ERR_ARG_INCOMP, "fields differ in their quadrature");
-    PetscCheck(Nb / Nc <= max_nodes, PETSC_COMM_SELF, PETSC_ERR_SUP, "more than %d nodes", max_nodes);
-    PetscCheck(Nc <= max_components, PETSC_COMM_SELF, PETSC_ERR_SUP, "more than %d components", (int)max_components);
-    basis.components = Nc;
-    basis.nodes = Nb / Nc;
-    basis.stride = (basis.nodes + 3) / 4 * 4;
-    basis.offset = fields.element_size;
-    PetscScalar *B = scratch.take(Np * basis.stride), *D = scratch.take(Np * dim * basis.stride);
-    for (PetscInt q = 0; q < Np; ++q) {
-      for (PetscInt a = 0; a < basis.nodes; ++a) {
-        const PetscInt row = ((replica * Np + q) * Nb + a * Nc) * Nc; // component 0 of node a
-        B[q * basis.stride + a] = T[f]->T[0][row];
-        for (PetscInt d = 0; d < dim; ++d) D[(q * dim + d) * basis.stride + a] = T[f]->T[1][row * dim + d];
-      }
-    }
-    basis.values = B;
-    basis.derivatives = D;
-    fields.element_size += Nb;
-    fields.uOff[f + 1] = fields.uOff[f] + Nc;
-    fields.uOff_x[f + 1] = fields.uOff_x[f] + Nc * dim;
-  }
-  fields.total_components = fields.uOff[fields.n];
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-/// Everything that callbacks read at the points of one cell or face.
-struct PointData {
-  const Fields *fields;
-  PetscScalar *gradients[max_fields];  ///< [point][dim][stride], real space; for matrices only
-  PetscReal inverse_J[dim * dim];      ///< d(reference)/d(real)
-  PetscScalar *u, *u_t, *u_x, *rate_x; ///< [point][...] with the offsets of Fields; rate_x: gradients of u_t
-  PetscScalar *weights;                ///< quadrature weight times det J
-  PetscReal *x, *normals;              ///< [point][3]
-  std::vector<PointState> states;
-  std::vector<Memory> memory; ///< [point]; empty if nothing is remembered here
-
-  PointData(const Fields &f, Scratch &scratch, bool matrices)
-      : fields(&f), states(static_cast<std::size_t>(f.points)), with_gradients(matrices)
-  {
-    for (PetscInt i = 0; i < f.n; ++i) gradients[i] = scratch.take(f.points * dim * f.basis[i].stride);
-    u = scratch.take(f.points * f.total_components);
-    u_t = scratch.take(f.points * f.total_components);
-    u_x = scratch.take(f.points * f.total_components * dim);
-    rate_x = scratch.take(f.points * f.total_components * dim);
-    weights = scratch.take(f.points);
-    x = scratch.take(f.points * dim);
-    normals = scratch.take(f.points * dim);
-  }
-  static std::size_t scratch_size(const Fields &f)
-  {
-    std::size_t size = Scratch::padded(f.points) + 2 * Scratch::padded(f.points * dim);
-    for (PetscInt i = 0; i < f.n; ++i) size += Scratch::padded(f.points * dim * f.basis[i].stride);
-    return size + 4 * Scratch::padded(f.points * f.total_components * dim);
-  }
-
-  /// Field values, rates and kinematic states (for matrices the basis' gradients, too) from the element's coefficients.
-  void evaluate(const PetscReal inverse[dim * dim], const PetscScalar coefficients[],
-                const PetscScalar coefficients_t[])
-  {
-    std::copy_n(inverse, dim * dim, inverse_J);
-    for (PetscInt f = 0; f < fields->n; ++f) {
-      interpolate(f, coefficients, coefficients_t);
-      if (with_gradients) map_gradients(f);
-    }
-    for (PetscInt q = 0; q < fields->points; ++q) {
-      const PetscInt offset = q * fields->total_components * dim + fields->uOff_x[displacement];
-      make_point_state(u_x + offset, rate_x + offset, states[q]);
-    }
-  }
-
-private:
-  void map_gradients(PetscInt f)
-  {
-    const PetscInt n = fields->basis[f].stride;
-    for (PetscInt q = 0; q < fields->points; ++q) {
-      for (PetscInt d = 0; d < dim; ++d) {
-        const PetscReal s[3] = {inverse_J[d], inverse_J[dim + d], inverse_J[2 * dim + d]};
-        combine(n, s, fields->basis[f].derivatives + q * dim * n, gradients[f] + (q * dim + d) * n);
-      }
-    }
-  }
-
-  /// Values and gradients of field @p f and of its rate at all points.
-  void interpolate(PetscInt f, const PetscScalar coefficients[], const PetscScalar coefficients_t[])
-  {
-    const ScalarBasis &basis = fields->basis[f];
-    const PetscInt n = basis.stride, C = basis.components, Nc = fields->total_components;
-    Vector8 node[max_nodes];
-    const auto entry = [&](const PetscScalar *list, PetscInt a, PetscInt c) {
-      return list && c < C ? list[basis.offset + a * C + c] : 0;
-    };
-    for (PetscInt a = 0; a < basis.nodes; ++a) {
-      const PetscScalar *e = coefficients, *e_t = coefficients_t;
-      node[a] = Vector8{entry(e, a, 0),   entry(e, a, 1),   entry(e, a, 2),   0,
-                        entry(e_t, a, 0), entry(e_t, a, 1), entry(e_t, a, 2), 0};
-    }
-    for (PetscInt q = 0; q < fields->points; ++q) {
-      const PetscScalar *B = basis.values + q * n, *D = basis.derivatives + q * dim * n;
-      Vector8 s{}, s_0{}, s_1{}, s_2{}; // value, derivatives in the reference cell
-      for (PetscInt a = 0; a < basis.nodes; ++a) {
-        s += B[a] * node[a];
-        s_0 += D[a] * node[a];
-        s_1 += D[n + a] * node[a];
-        s_2 += D[2 * n + a] * node[a];
-      }
-      PetscScalar *value = u + q * Nc + fields->uOff[f], *rate = u_t + q * Nc + fields->uOff[f];
-      for (PetscInt c = 0; c < C; ++c) {
-        value[c] = s[c];
-        rate[c] = s[4 + c];
-      }
-      for (PetscInt d = 0; d < dim; ++d) {
-        const Vector8 g = inverse_J[d] * s_0 + inverse_J[dim + d] * s_1 + inverse_J[2 * dim + d] * s_2;
-        const PetscInt place = q * Nc * dim + fields->uOff_x[f] + d;
-        for (PetscInt c = 0; c < C; ++c) {
-          u_x[place + c * dim] = g[c];
-          rate_x[place + c * dim] = g[4 + c];
-        }
-      }
-    }
-  }
-
-  bool with_gradients;
-};
 
 // ------------------------------------------------------------------------------------------------- callbacks
 
@@ -381,119 +136,6 @@ struct JacobianCallbacks {
   PetscInt count() const { return n0 + n1 + n2 + n3; }
 };
 
-/// vector[node * C + c] += sum_q w (f0_c B + f1_cd G_d), with f1 taken to the reference cell instead of G from it.
-void add_to_vector(const PointData &data, PetscInt field, const PetscScalar *f0, const PetscScalar *f1,
-                   PetscScalar *vector)
-{
-  const ScalarBasis &basis = data.fields->basis[field];
-  const PetscInt C = basis.components, n = basis.stride;
-  const PetscReal *K = data.inverse_J;
-  alignas(64) PetscScalar sum[max_nodes];
-  for (PetscInt c = 0; c < C; ++c) {
-    for (PetscInt a = 0; a < n; ++a) sum[a] = 0;
-    for (PetscInt q = 0; q < data.fields->points; ++q) {
-      const PetscScalar w = data.weights[q], *B = basis.values + q * n, *D = basis.derivatives + q * dim * n;
-      if (f0) {
-        const PetscScalar s = w * f0[q * C + c];
-        for (PetscInt a = 0; a < n; a += 4) four(sum + a) += s * four(B + a);
-      }
-      if (f1) {
-        const PetscScalar *f = f1 + (q * C + c) * dim;
-        PetscScalar s[dim];
-        for (PetscInt e = 0; e < dim; ++e)
-          s[e] = w * (f[0] * K[e * dim] + f[1] * K[e * dim + 1] + f[2] * K[e * dim + 2]);
-        for (PetscInt a = 0; a < n; a += 4)
-          four(sum + a) += s[0] * four(D + a) + s[1] * four(D + n + a) + s[2] * four(D + 2 * n + a);
-      }
-    }
-    for (PetscInt a = 0; a < basis.nodes; ++a) vector[basis.offset + a * C + c] += sum[a];
-  }
-}
-
-/// The element matrix of one pair of fields from g0 ... g3 at all points (null where a pair has none).
-struct MatrixBuilder {
-  const PointData &data;
-  PetscScalar *left, *right, *block; ///< [rank][stride of test], [rank][stride of trial], [node][stride of trial]
-
-  static constexpr PetscInt rows_per_point = dim + 1;
-
-  static std::size_t scratch_size(const Fields &f)
-  {
-    std::size_t widest = 0;
-    for (PetscInt i = 0; i < f.n; ++i) widest = std::max(widest, Scratch::padded(f.basis[i].stride));
-    return (2 * static_cast<std::size_t>(f.points * rows_per_point) + widest + 8) * widest;
-  }
-  MatrixBuilder(const PointData &d, Scratch &scratch) : data(d)
-  {
-    std::size_t widest = 0;
-    for (PetscInt i = 0; i < d.fields->n; ++i) widest = std::max(widest, Scratch::padded(d.fields->basis[i].stride));
-    left = scratch.take(d.fields->points * rows_per_point * widest);
-    right = scratch.take(d.fields->points * rows_per_point * widest);
-    block = scratch.take(widest * widest);
-  }
-
-  /// The rows of R of one pair of components, R[r] = w (sum_d g_rd G_d + g_r B).
-  void fill_right(PetscInt trial, PetscInt pair, PetscInt pairs, const PetscScalar *g0, const PetscScalar *g1,
-                  const PetscScalar *g2, const PetscScalar *g3) const
-  {
-    const ScalarBasis &basis = data.fields->basis[trial];
-    const PetscInt n = basis.stride;
-    PetscScalar *r = right;
-    for (PetscInt q = 0; q < data.fields->points; ++q) {
-      const PetscScalar w = data.weights[q], *B = basis.values + q * n, *G = data.gradients[trial] + q * dim * n;
-      const auto row = [&](const PetscScalar *g, const PetscScalar *value) {
-        const PetscScalar v = value ? w * *value : 0;
-        if (g) {
-          const PetscScalar s[3] = {w * g[0], w * g[1], w * g[2]};
-          combine(n, s, G, r);
-          if (value)
-            for (PetscInt b = 0; b < n; b += 4) four(r + b) += v * four(B + b);
-        } else {
-          for (PetscInt b = 0; b < n; b += 4) four(r + b) = v * four(B + b);
-        }
-        r += n;
-      };
-      const PetscInt place = q * pairs + pair;
-      if (g2 || g3)
-        for (PetscInt d = 0; d < dim; ++d)
-          row(g3 ? g3 + (place * dim + d) * dim : nullptr, g2 ? g2 + place * dim + d : nullptr);
-      if (g0 || g1) row(g1 ? g1 + place * dim : nullptr, g0 ? g0 + place : nullptr);
-    }
-  }
-
-  void add(PetscInt test, PetscInt trial, const PetscScalar *g0, const PetscScalar *g1, const PetscScalar *g2,
-           const PetscScalar *g3, PetscScalar *matrix) const
-  {
-    const ScalarBasis &bi = data.fields->basis[test], &bj = data.fields->basis[trial];
-    const PetscInt Ci = bi.components, Cj = bj.components, ni = bi.stride, nj = bj.stride, Nq = data.fields->points;
-    const bool by_gradient = g2 || g3, by_value = g0 || g1; // of the test function
-    const PetscInt per_point = dim * by_gradient + by_value, rank = Nq * per_point;
-
-    for (PetscInt q = 0; q < Nq; ++q) {
-      PetscScalar *l = left + q * per_point * ni;
-      if (by_gradient) {
-        const PetscScalar *G = data.gradients[test] + q * dim * ni;
-        for (PetscInt i = 0; i < dim * ni; ++i) l[i] = G[i];
-        l += dim * ni;
-      }
-      if (by_value)
-        for (PetscInt i = 0; i < ni; ++i) l[i] = bi.values[q * ni + i];
-    }
-    for (PetscInt c = 0; c < Ci; ++c) {
-      for (PetscInt e = 0; e < Cj; ++e) {
-        const PetscInt pair = c * Cj + e;
-        fill_right(trial, pair, Ci * Cj, g0, g1, g2, g3);
-        for (PetscInt i = 0; i < bi.nodes * nj; ++i) block[i] = 0;
-        product(bi.nodes, rank, left, ni, right, nj, block);
-        for (PetscInt a = 0; a < bi.nodes; ++a) {
-          PetscScalar *row = matrix + (bi.offset + a * Ci + c) * data.fields->element_size + bj.offset + e;
-          for (PetscInt b = 0; b < bj.nodes; ++b) row[b * Cj] += block[a * nj + b];
-        }
-      }
-    }
-  }
-};
-
 // -------------------------------------------------------------------------------------------- cells and facets
 
 /// The cells or facets of one call: their tabulations, rule, constants and geometry.
@@ -529,7 +171,7 @@ public:
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
-  const Fields &fields() const { return fields_[0]; }
+  const TabulatedFields &fields() const { return fields_[0]; }
 
   /// Makes room for what is remembered at the points, if anything is.
   void remember(PointData &data) const
@@ -581,7 +223,7 @@ private:
   bool facets_;
   const PetscReal *reference_ = nullptr, *weights_ = nullptr;
   std::optional<Scratch> tables_;
-  Fields fields_[4];
+  TabulatedFields fields_[4];
   PlaceData *places_data_ = nullptr;
   std::vector<PetscScalar> local_constants_;
 };
@@ -604,7 +246,7 @@ PetscErrorCode integrate_vectors(PetscDS ds, PetscWeakForm wf, const PetscFormKe
   }
   if (*n_calls == 0) PetscFunctionReturn(PETSC_SUCCESS);
   PetscCall(places.setup());
-  const Fields &fields = places.fields();
+  const TabulatedFields &fields = places.fields();
   const PetscInt Nq = fields.points;
   Scratch work(PointData::scratch_size(fields) + 2 * Scratch::padded(Nq * 9));
   PointData data(fields, work, false);
@@ -651,7 +293,7 @@ PetscErrorCode integrate_matrices(PetscDS ds, PetscWeakForm wf, const PetscFormK
   }
   if (*n_calls == 0) PetscFunctionReturn(PETSC_SUCCESS);
   PetscCall(places.setup());
-  const Fields &fields = places.fields();
+  const TabulatedFields &fields = places.fields();
   const PetscInt Nq = fields.points;
   Scratch work(PointData::scratch_size(fields) + MatrixBuilder::scratch_size(fields) + 4 * Scratch::padded(Nq * 81));
   PointData data(fields, work, true);

@@ -1,13 +1,13 @@
 /// @file
 /// The loop over cells: gathers coefficients in blocks, integrates them through PetscFE, adds the element vectors
-/// and matrices. Positions in the sparse matrix are found once; no more than one block of element matrices exists.
+/// and matrices. No more than one block of element matrices exists.
 #pragma once
 
 #include "pulmo/base/petsc.hpp"
 #include "pulmo/fem/integration.hpp"
+#include "pulmo/fem/matrix_map.hpp"
 #include "pulmo/physics/kinematics.hpp"
 
-#include <cstdint>
 #include <vector>
 
 namespace pulmo {
@@ -74,14 +74,13 @@ public:
   void point_states(PetscInt c, const PetscScalar *x, std::vector<PointState> &states) const;
   /// Weights of the quadrature points, summing to 1.
   const std::vector<PetscReal> &relative_weights() const { return relative_weights_; }
-  PetscInt cells() const { return cells_; }
+  PetscInt cells() const { return layout_.cells; }
   /// Offsets in the local vector of the dofs of cell @p c, field by field in the order of the basis.
-  const PetscInt *cell_dofs(PetscInt c) const { return &cell_dofs_[c * element_size_]; }
+  const PetscInt *cell_dofs(PetscInt c) const { return layout_.cell_dofs(c); }
   const IntegrationLog &log() const { return log_; }
 
 private:
   struct Facets;
-  struct MatrixMap;
 
   PetscErrorCode setup_cells();
   PetscErrorCode setup_facets();
@@ -93,22 +92,17 @@ private:
   PetscInt places_per_call() const;
   PetscErrorCode put_places(const std::vector<PetscReal> &rows, bool cells, PetscInt begin);
   PetscFEGeom block_geometry(PetscInt begin, PetscInt n);
-  PetscErrorCode map_matrix(Mat A);
-  PetscErrorCode add_to_matrix(PetscInt cell, const PetscScalar *matrix, const PetscReal row_scale[], Mat A);
 
   DM dm_ = nullptr; ///< not owned
   PetscDS ds_ = nullptr, rate_ds_ = nullptr;
-  PetscInt n_fields_ = 0, cells_ = 0, first_cell_ = 0, element_size_ = 0, points_per_cell_ = 0;
-  std::vector<PetscInt> cell_dofs_;   ///< [cell][element_size]: offset in the local vector
-  std::vector<PetscInt> cell_points_; ///< [cell][points_per_cell]: mesh points that carry dofs
-  std::vector<PetscInt> dof_point_;   ///< [element_size]: which of these points a dof of the element belongs to
-  std::vector<PetscInt> dof_field_;   ///< [element_size]
+  PetscInt n_fields_ = 0, first_cell_ = 0;
+  CellLayout layout_;
   std::vector<PetscReal> v0_, J_, invJ_, detJ_;
   std::vector<PetscReal> sample_gradients_; ///< d(basis)/d(xi) at quadrature points, then corners: [point][node][3]
   PetscInt sample_points_ = 0, nodes_ = 0;
   std::vector<PetscReal> sample_weights_, relative_weights_;
   std::vector<Facets *> facets_;
-  MatrixMap *map_ = nullptr;
+  MatrixMap map_;
   PlaceData places_;
   const PointMemory *memory_ = nullptr;
   std::vector<PetscReal> cell_constants_; ///< [cell][those that differ]

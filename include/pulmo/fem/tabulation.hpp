@@ -1,0 +1,136 @@
+/// @file
+/// Basis functions at the points of a rule, and what callbacks read at these points of one cell or face.
+#pragma once
+
+#include "pulmo/fem/dense.hpp"
+#include "pulmo/physics/point.hpp"
+
+#include <algorithm>
+#include <vector>
+
+namespace pulmo::element {
+
+constexpr PetscInt dim = 3;
+constexpr PetscInt max_fields = 4;
+constexpr PetscInt max_components = 3;
+
+/// One scalar component of a Lagrange basis at the points of a rule, rows padded to a multiple of 4.
+struct ScalarBasis {
+  PetscInt nodes = 0, components = 0, stride = 0, offset = 0; ///< offset: of the field in the element vector
+  const PetscScalar *values = nullptr;                        ///< [point][stride]
+  const PetscScalar *derivatives = nullptr;                   ///< [point][dim][stride], in the reference cell
+};
+
+/// The fields of a PetscDS at a rule.
+struct TabulatedFields {
+  PetscInt n = 0, points = 0, element_size = 0, total_components = 0;
+  PetscInt uOff[max_fields + 1], uOff_x[max_fields + 1]; ///< as PetscDS: where a field's values and gradients begin
+  ScalarBasis basis[max_fields];
+};
+
+/// Scalars that make_fields() takes for @p replicas.
+std::size_t fields_scratch(PetscInt n, PetscTabulation *T, PetscInt replicas);
+
+/// Copies one component of PETSc's tabulation. @p replica: the face of the reference cell, 0 for cells.
+PetscErrorCode make_fields(PetscDS ds, PetscTabulation *T, PetscInt replica, Scratch &scratch, TabulatedFields &fields);
+
+/// Everything that callbacks read at the points of one cell or face.
+struct PointData {
+  const TabulatedFields *fields;
+  PetscScalar *gradients[max_fields];  ///< [point][dim][stride], real space; for matrices only
+  PetscReal inverse_J[dim * dim];      ///< d(reference)/d(real)
+  PetscScalar *u, *u_t, *u_x, *rate_x; ///< [point][...] with the offsets of TabulatedFields; rate_x: gradients of u_t
+  PetscScalar *weights;                ///< quadrature weight times det J
+  PetscReal *x, *normals;              ///< [point][3]
+  std::vector<PointState> states;
+  std::vector<Memory> memory; ///< [point]; empty if nothing is remembered here
+
+  PointData(const TabulatedFields &f, Scratch &scratch, bool matrices)
+      : fields(&f), states(static_cast<std::size_t>(f.points)), with_gradients(matrices)
+  {
+    for (PetscInt i = 0; i < f.n; ++i) gradients[i] = scratch.take(f.points * dim * f.basis[i].stride);
+    u = scratch.take(f.points * f.total_components);
+    u_t = scratch.take(f.points * f.total_components);
+    u_x = scratch.take(f.points * f.total_components * dim);
+    rate_x = scratch.take(f.points * f.total_components * dim);
+    weights = scratch.take(f.points);
+    x = scratch.take(f.points * dim);
+    normals = scratch.take(f.points * dim);
+  }
+  static std::size_t scratch_size(const TabulatedFields &f)
+  {
+    std::size_t size = Scratch::padded(f.points) + 2 * Scratch::padded(f.points * dim);
+    for (PetscInt i = 0; i < f.n; ++i) size += Scratch::padded(f.points * dim * f.basis[i].stride);
+    return size + 4 * Scratch::padded(f.points * f.total_components * dim);
+  }
+
+  /// Field values, rates and kinematic states (for matrices the basis' gradients, too) from the element's coefficients.
+  void evaluate(const PetscReal inverse[dim * dim], const PetscScalar coefficients[],
+                const PetscScalar coefficients_t[])
+  {
+    std::copy_n(inverse, dim * dim, inverse_J);
+    for (PetscInt f = 0; f < fields->n; ++f) {
+      interpolate(f, coefficients, coefficients_t);
+      if (with_gradients) map_gradients(f);
+    }
+    for (PetscInt q = 0; q < fields->points; ++q) {
+      const PetscInt offset = q * fields->total_components * dim + fields->uOff_x[displacement];
+      make_point_state(u_x + offset, rate_x + offset, states[q]);
+    }
+  }
+
+private:
+  void map_gradients(PetscInt f)
+  {
+    const PetscInt n = fields->basis[f].stride;
+    for (PetscInt q = 0; q < fields->points; ++q) {
+      for (PetscInt d = 0; d < dim; ++d) {
+        const PetscReal s[3] = {inverse_J[d], inverse_J[dim + d], inverse_J[2 * dim + d]};
+        combine(n, s, fields->basis[f].derivatives + q * dim * n, gradients[f] + (q * dim + d) * n);
+      }
+    }
+  }
+
+  /// Values and gradients of field @p f and of its rate at all points.
+  void interpolate(PetscInt f, const PetscScalar coefficients[], const PetscScalar coefficients_t[])
+  {
+    const ScalarBasis &basis = fields->basis[f];
+    const PetscInt n = basis.stride, C = basis.components, Nc = fields->total_components;
+    Vector8 node[max_nodes];
+    const auto entry = [&](const PetscScalar *list, PetscInt a, PetscInt c) {
+      return list && c < C ? list[basis.offset + a * C + c] : 0;
+    };
+    for (PetscInt a = 0; a < basis.nodes; ++a) {
+      const PetscScalar *e = coefficients, *e_t = coefficients_t;
+      node[a] = Vector8{entry(e, a, 0),   entry(e, a, 1),   entry(e, a, 2),   0,
+                        entry(e_t, a, 0), entry(e_t, a, 1), entry(e_t, a, 2), 0};
+    }
+    for (PetscInt q = 0; q < fields->points; ++q) {
+      const PetscScalar *B = basis.values + q * n, *D = basis.derivatives + q * dim * n;
+      Vector8 s{}, s_0{}, s_1{}, s_2{}; // value, derivatives in the reference cell
+      for (PetscInt a = 0; a < basis.nodes; ++a) {
+        s += B[a] * node[a];
+        s_0 += D[a] * node[a];
+        s_1 += D[n + a] * node[a];
+        s_2 += D[2 * n + a] * node[a];
+      }
+      PetscScalar *value = u + q * Nc + fields->uOff[f], *rate = u_t + q * Nc + fields->uOff[f];
+      for (PetscInt c = 0; c < C; ++c) {
+        value[c] = s[c];
+        rate[c] = s[4 + c];
+      }
+      for (PetscInt d = 0; d < dim; ++d) {
+        const Vector8 g = inverse_J[d] * s_0 + inverse_J[dim + d] * s_1 + inverse_J[2 * dim + d] * s_2;
+        const PetscInt place = q * Nc * dim + fields->uOff_x[f] + d;
+        for (PetscInt c = 0; c < C; ++c) {
+          u_x[place + c * dim] = g[c];
+          rate_x[place + c * dim] = g[4 + c];
+        }
+      }
+    }
+  }
+
+  bool with_gradients;
+};
+
+} // namespace pulmo::element
