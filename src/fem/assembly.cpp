@@ -113,28 +113,20 @@ PetscErrorCode Assembly::setup_cells()
     layout_.of_cell.insert(layout_.of_cell.end(), points.begin(), points.end());
   }
 
-  // where J is watched: the quadrature points, then the corners of the reference cell
   PetscFE fe;
   PetscQuadrature rule;
   PetscInt Nq;
   const PetscReal *xi, *weights;
-  PetscTabulation T;
   PetscCall(PetscDSGetDiscretization(ds_, 0, (PetscObject *)&fe));
   PetscCall(PetscFEGetQuadrature(fe, &rule));
   PetscCall(PetscQuadratureGetData(rule, nullptr, nullptr, &Nq, &xi, &weights));
-  std::vector<PetscReal> samples(xi, xi + 3 * Nq);
-  samples.insert(samples.end(), {-1, -1, -1, 1, -1, -1, -1, 1, -1, -1, -1, 1});
-  sample_points_ = Nq + 4;
-  sample_weights_.assign(weights, weights + Nq);
+  std::vector<PetscReal> points(xi, xi + 3 * Nq);
+  points.insert(points.end(), {-1, -1, -1, 1, -1, -1, -1, 1, -1, -1, -1, 1});
+  watched_points_ = Nq + 4;
+  PetscCall(watched_.setup(fe, points));
+  rule_weights_.assign(weights, weights + Nq);
   const PetscReal total = std::accumulate(weights, weights + Nq, PetscReal(0));
-  for (PetscReal w : sample_weights_) relative_weights_.push_back(w / total);
-  PetscCall(PetscFECreateTabulation(fe, 1, sample_points_, samples.data(), 1, &T));
-  nodes_ = T->Nb / T->Nc;
-  PetscCheck(nodes_ <= max_nodes, PETSC_COMM_SELF, PETSC_ERR_SUP, "elements with more than %d nodes", max_nodes);
-  for (PetscInt q = 0; q < sample_points_; ++q)
-    for (PetscInt a = 0; a < nodes_; ++a)
-      for (PetscInt d = 0; d < 3; ++d) sample_gradients_.push_back(T->T[1][((q * T->Nb + a * T->Nc) * T->Nc) * 3 + d]);
-  PetscCall(PetscTabulationDestroy(&T));
+  for (PetscReal w : rule_weights_) relative_weights_.push_back(w / total);
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

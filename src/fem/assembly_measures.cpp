@@ -8,39 +8,42 @@
 
 namespace pulmo {
 
-/// Displacements of the nodes of a cell; the fourth entry is zero.
-struct NodeDisplacements {
-  Vector4 of[max_nodes];
-  Vector4 &operator[](PetscInt a) { return of[a]; }
-  const Vector4 &operator[](PetscInt a) const { return of[a]; }
+namespace {
+
+/// Displacement in one cell, for its gradient at the points of a table.
+class CellDisplacement {
+public:
+  CellDisplacement(const element::BasisTable &table, const PetscReal inverse[9], const PetscInt *dofs,
+                   const PetscScalar *x)
+      : basis_(table.basis()), inverse_(inverse)
+  {
+    for (PetscInt a = 0; a < basis_.nodes; ++a)
+      node_[a] = Vector4{x[dofs[3 * a]], x[dofs[3 * a + 1]], x[dofs[3 * a + 2]], 0};
+  }
+  /// Grad u at point @p q.
+  void gradient(PetscInt q, PetscScalar H[9]) const
+  {
+    Vector4 value, g[3];
+    element::interpolate(basis_, q, inverse_, node_, value, g);
+    for (int i = 0; i < 3; ++i)
+      for (int d = 0; d < 3; ++d) H[3 * i + d] = g[d][i];
+  }
+
+private:
+  element::ScalarBasis basis_;
+  const PetscReal *inverse_;
+  Vector4 node_[max_nodes];
 };
 
-static void gather_displacements(const PetscInt *dofs, PetscInt nodes, const PetscScalar *x, NodeDisplacements &u)
-{
-  for (PetscInt a = 0; a < nodes; ++a) u[a] = Vector4{x[dofs[3 * a]], x[dofs[3 * a + 1]], x[dofs[3 * a + 2]], 0};
-}
-
-/// Grad u at a sample point, with @p D the derivatives of the basis there, from the cell's displacements.
-static void sample_gradient(const PetscReal *D, const PetscReal *inverse, PetscInt nodes, const NodeDisplacements &u,
-                            PetscScalar H[9])
-{
-  Vector4 along[3] = {}; // the axes of the reference cell
-  for (PetscInt a = 0; a < nodes; ++a)
-    for (int g = 0; g < 3; ++g) along[g] += D[3 * a + g] * u[a];
-  for (int d = 0; d < 3; ++d) {
-    const Vector4 h = along[0] * inverse[d] + along[1] * inverse[3 + d] + along[2] * inverse[6 + d];
-    for (int i = 0; i < 3; ++i) H[3 * i + d] = h[i];
-  }
-}
+} // namespace
 
 void Assembly::point_states(PetscInt c, const PetscScalar *x, std::vector<PointState> &states) const
 {
-  NodeDisplacements u;
-  states.resize(sample_points_);
-  gather_displacements(cell_dofs(c), nodes_, x, u);
-  for (PetscInt q = 0; q < sample_points_; ++q) {
+  const CellDisplacement u(watched_, &invJ_[9 * c], cell_dofs(c), x);
+  states.resize(watched_points_);
+  for (PetscInt q = 0; q < watched_points_; ++q) {
     PetscScalar H[9];
-    sample_gradient(&sample_gradients_[q * nodes_ * 3], &invJ_[9 * c], nodes_, u, H);
+    u.gradient(q, H);
     make_point_state(H, nullptr, states[q]);
   }
 }
@@ -48,7 +51,7 @@ void Assembly::point_states(PetscInt c, const PetscScalar *x, std::vector<PointS
 PetscErrorCode Assembly::measure(Vec x, Measures &measures) const
 {
   const MPI_Comm comm = PetscObjectComm((PetscObject)dm_);
-  const auto n_rule = static_cast<PetscInt>(sample_weights_.size());
+  const auto n_rule = static_cast<PetscInt>(rule_weights_.size());
   struct {
     double value;
     int rank;
@@ -60,16 +63,15 @@ PetscErrorCode Assembly::measure(Vec x, Measures &measures) const
   PetscCallMPI(MPI_Comm_rank(comm, &least.rank));
   const ReadArray xs(x);
   for (PetscInt c = 0; c < layout_.cells; ++c) {
-    NodeDisplacements u;
-    gather_displacements(cell_dofs(c), nodes_, xs.data(), u);
+    const CellDisplacement u(watched_, &invJ_[9 * c], cell_dofs(c), xs.data());
     double sum = 0;
-    for (PetscInt q = 0; q < sample_points_; ++q) {
+    for (PetscInt q = 0; q < watched_points_; ++q) {
       PetscScalar H[9];
-      sample_gradient(&sample_gradients_[q * nodes_ * 3], &invJ_[9 * c], nodes_, u, H);
+      u.gradient(q, H);
       const double Jm1 = jacobian_minus_one(H), J = 1 + Jm1;
       extremes[0] = std::max(extremes[0], J);
       if (q < n_rule) {
-        sum += sample_weights_[q] * Jm1;
+        sum += rule_weights_[q] * Jm1;
         extremes[1] = std::max(extremes[1], std::isnan(J) ? PETSC_MAX_REAL : -J);
       }
       if (!(J >= least.value)) { // also taken when J is not a number
@@ -103,18 +105,16 @@ PetscErrorCode Assembly::volume_derivative(Vec x, Vec y, PetscReal &derivative) 
   const ReadArray xs(x), ys(y);
   derivative = 0;
   for (PetscInt c = 0; c < layout_.cells; ++c) {
-    NodeDisplacements u, v;
-    gather_displacements(cell_dofs(c), nodes_, xs.data(), u);
-    gather_displacements(cell_dofs(c), nodes_, ys.data(), v);
+    const CellDisplacement u(watched_, &invJ_[9 * c], cell_dofs(c), xs.data());
+    const CellDisplacement v(watched_, &invJ_[9 * c], cell_dofs(c), ys.data());
     PetscReal sum = 0;
-    for (std::size_t q = 0; q < sample_weights_.size(); ++q) {
+    for (std::size_t q = 0; q < rule_weights_.size(); ++q) {
       PetscScalar H[9], G[9], cof_F[9];
-      const PetscReal *gradients = &sample_gradients_[q * nodes_ * 3];
-      sample_gradient(gradients, &invJ_[9 * c], nodes_, u, H);
-      sample_gradient(gradients, &invJ_[9 * c], nodes_, v, G);
+      u.gradient(static_cast<PetscInt>(q), H);
+      v.gradient(static_cast<PetscInt>(q), G);
       for (int i = 0; i < 3; ++i) H[4 * i] += 1;
       cofactor(H, cof_F);
-      sum += sample_weights_[q] * contract(cof_F, G);
+      sum += rule_weights_[q] * contract(cof_F, G);
     }
     derivative += sum * detJ_[c];
   }

@@ -90,28 +90,18 @@ PetscErrorCode Sampling::setup(const Model &model)
 PetscErrorCode Sampling::add_table(const std::vector<PetscReal> &xi, const std::vector<PetscReal> &weights)
 {
   PetscDS ds;
+  PetscFE fe;
   Table table;
-  const auto n = static_cast<PetscInt>(weights.size());
 
   PetscFunctionBeginUser;
   table.weights = weights;
   table.xi = xi;
   PetscCall(DMGetDS(dm_, &ds));
-  for (PetscInt field = 0; field <= (gas_ ? pressure : displacement); ++field) {
-    PetscFE fe;
-    PetscTabulation T;
-    std::vector<PetscReal> &values = field == displacement ? table.u : table.p;
-    std::vector<PetscReal> &gradients = field == displacement ? table.du : table.dp;
-    PetscCall(PetscDSGetDiscretization(ds, field, (PetscObject *)&fe));
-    PetscCall(PetscFECreateTabulation(fe, 1, n, xi.data(), 1, &T));
-    const PetscInt nodes = T->Nb / T->Nc; // a vector field repeats the scalar basis for each component
-    (field == displacement ? nodes_ : corners_) = nodes;
-    for (PetscInt i = 0; i < n * nodes; ++i) {
-      const PetscInt entry = ((i / nodes) * T->Nb + (i % nodes) * T->Nc) * T->Nc;
-      values.push_back(T->T[0][entry]);
-      gradients.insert(gradients.end(), T->T[1] + entry * 3, T->T[1] + entry * 3 + 3);
-    }
-    PetscCall(PetscTabulationDestroy(&T));
+  PetscCall(PetscDSGetDiscretization(ds, displacement, (PetscObject *)&fe));
+  PetscCall(table.u.setup(fe, xi));
+  if (gas_) {
+    PetscCall(PetscDSGetDiscretization(ds, pressure, (PetscObject *)&fe));
+    PetscCall(table.p.setup(fe, xi));
   }
   tables_.push_back(std::move(table));
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -154,37 +144,32 @@ PetscErrorCode Sampling::surface(const Mesh &mesh, const std::string &name, std:
 void Sampling::sample(const Element &e, const PetscScalar *x, std::vector<PointSample> &samples) const
 {
   const Table &t = tables_[e.table];
+  const element::ScalarBasis of_u = t.u.basis(), of_p = t.p.basis();
   const PetscInt *dofs = assembly_->cell_dofs(e.cell);
+  Vector4 u[max_nodes], p[max_nodes], value, gradient[3];
 
+  for (PetscInt a = 0; a < of_u.nodes; ++a) u[a] = Vector4{x[dofs[3 * a]], x[dofs[3 * a + 1]], x[dofs[3 * a + 2]], 0};
+  for (PetscInt a = 0; a < of_p.nodes; ++a) p[a] = Vector4{x[dofs[3 * of_u.nodes + a]], 0, 0, 0};
   samples.resize(t.weights.size());
   for (std::size_t q = 0; q < samples.size(); ++q) {
+    const auto point = static_cast<PetscInt>(q);
     PointSample &s = samples[q];
-    PetscScalar A[9] = {0}, H[9], b[3] = {0, 0, 0};
+    PetscScalar H[9];
+    element::interpolate(of_u, point, e.inverse, u, value, gradient);
+    for (int i = 0; i < 3; ++i) {
+      s.u[i] = value[i];
+      for (int d = 0; d < 3; ++d) H[3 * i + d] = gradient[d][i];
+    }
+    make_point_state(H, nullptr, s.state);
+    element::interpolate(of_p, point, e.inverse, p, value, gradient);
+    s.p = value[0];
+    s.p_t = 0;
     for (int d = 0; d < 3; ++d) {
-      s.u[d] = s.grad_p[d] = s.u_t[d] = s.grad_p_t[d] = 0;
+      s.grad_p[d] = gradient[d][0];
+      s.u_t[d] = s.grad_p_t[d] = 0;
       s.x[d] = e.v0[d];
       for (int i = 0; i < 3; ++i) s.x[d] += e.J[3 * d + i] * (t.xi[3 * q + i] + 1);
     }
-    for (PetscInt a = 0; a < nodes_; ++a) {
-      const PetscReal N = t.u[q * nodes_ + a], *dN = &t.du[3 * (q * nodes_ + a)];
-      for (int i = 0; i < 3; ++i) {
-        const PetscScalar value = x[dofs[3 * a + i]];
-        s.u[i] += value * N;
-        for (int d = 0; d < 3; ++d) A[3 * i + d] += value * dN[d];
-      }
-    }
-    for (int i = 0; i < 3; ++i)
-      for (int d = 0; d < 3; ++d)
-        H[3 * i + d] = A[3 * i] * e.inverse[d] + A[3 * i + 1] * e.inverse[3 + d] + A[3 * i + 2] * e.inverse[6 + d];
-    make_point_state(H, nullptr, s.state);
-    s.p = s.p_t = 0;
-    for (PetscInt a = 0; a < corners_; ++a) {
-      const PetscScalar value = x[dofs[3 * nodes_ + a]];
-      s.p += value * t.p[q * corners_ + a];
-      for (int d = 0; d < 3; ++d) b[d] += value * t.dp[3 * (q * corners_ + a) + d];
-    }
-    for (int d = 0; d < 3; ++d)
-      for (int i = 0; i < 3; ++i) s.grad_p[d] += b[i] * e.inverse[3 * i + d];
   }
 }
 

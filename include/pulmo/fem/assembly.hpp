@@ -6,6 +6,7 @@
 #include "pulmo/base/petsc.hpp"
 #include "pulmo/fem/integration.hpp"
 #include "pulmo/fem/matrix_map.hpp"
+#include "pulmo/fem/tabulation.hpp"
 #include "pulmo/physics/kinematics.hpp"
 
 #include <vector>
@@ -98,9 +99,9 @@ private:
   PetscInt n_fields_ = 0, first_cell_ = 0;
   CellLayout layout_;
   std::vector<PetscReal> v0_, J_, invJ_, detJ_;
-  std::vector<PetscReal> sample_gradients_; ///< d(basis)/d(xi) at quadrature points, then corners: [point][node][3]
-  PetscInt sample_points_ = 0, nodes_ = 0;
-  std::vector<PetscReal> sample_weights_, relative_weights_;
+  element::BasisTable watched_; ///< of displacement where J is watched: the quadrature points, then the corners
+  PetscInt watched_points_ = 0;
+  std::vector<PetscReal> rule_weights_, relative_weights_;
   std::vector<Facets *> facets_;
   MatrixMap map_;
   PlaceData places_;

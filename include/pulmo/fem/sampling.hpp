@@ -54,8 +54,7 @@ private:
   /// Basis functions at the points of a rule on the reference cell.
   struct Table {
     std::vector<PetscReal> weights, xi; ///< weights sum to 1
-    std::vector<PetscReal> u, du;       ///< [point][node], [point][node][3], by xi
-    std::vector<PetscReal> p, dp;
+    element::BasisTable u, p;
   };
 
   PetscErrorCode add_table(const std::vector<PetscReal> &xi, const std::vector<PetscReal> &weights);
@@ -63,8 +62,7 @@ private:
   DM dm_ = nullptr; ///< not owned
   const Assembly *assembly_ = nullptr;
   bool gas_ = false;
-  PetscInt nodes_ = 0, corners_ = 0;
-  std::vector<Table> tables_; ///< of the cell, then of the faces opposite its corners
+  std::vector<Table> tables_; ///< of the cell, then of its faces
   std::vector<Element> cells_;
 };
 

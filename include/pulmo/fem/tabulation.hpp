@@ -21,6 +21,39 @@ struct ScalarBasis {
   const PetscScalar *derivatives = nullptr;                   ///< [point][dim][stride], in the reference cell
 };
 
+/// Value and gradient at point @p q of a field that is node[a] at node a, a vector of components; @p inverse: of the
+/// cell's map, d(reference)/d(real).
+template <class V>
+static inline void interpolate(const ScalarBasis &basis, PetscInt q, const PetscReal inverse[dim * dim], const V node[],
+                               V &value, V gradient[dim])
+{
+  const PetscInt n = basis.stride;
+  const PetscScalar *B = basis.values + q * n, *D = basis.derivatives + q * dim * n;
+  V s{}, s_0{}, s_1{}, s_2{}; // value, derivatives in the reference cell
+  for (PetscInt a = 0; a < basis.nodes; ++a) {
+    s += B[a] * node[a];
+    s_0 += D[a] * node[a];
+    s_1 += D[n + a] * node[a];
+    s_2 += D[2 * n + a] * node[a];
+  }
+  value = s;
+  for (PetscInt d = 0; d < dim; ++d)
+    gradient[d] = inverse[d] * s_0 + inverse[dim + d] * s_1 + inverse[2 * dim + d] * s_2;
+}
+
+/// One component of an element's basis at points of one's own.
+class BasisTable {
+public:
+  /// @p xi: points of the reference cell, one after the other.
+  PetscErrorCode setup(PetscFE fe, const std::vector<PetscReal> &xi);
+  ScalarBasis basis() const { return {nodes_, components_, stride_, 0, values_.data(), derivatives_.data()}; }
+  PetscInt nodes() const { return nodes_; }
+
+private:
+  PetscInt nodes_ = 0, components_ = 0, stride_ = 0;
+  std::vector<PetscScalar> values_, derivatives_;
+};
+
 /// The fields of a PetscDS at a rule.
 struct TabulatedFields {
   PetscInt n = 0, points = 0, element_size = 0, total_components = 0;
@@ -70,7 +103,7 @@ struct PointData {
   {
     std::copy_n(inverse, dim * dim, inverse_J);
     for (PetscInt f = 0; f < fields->n; ++f) {
-      interpolate(f, coefficients, coefficients_t);
+      evaluate(f, coefficients, coefficients_t);
       if (with_gradients) map_gradients(f);
     }
     for (PetscInt q = 0; q < fields->points; ++q) {
@@ -92,10 +125,10 @@ private:
   }
 
   /// Values and gradients of field @p f and of its rate at all points.
-  void interpolate(PetscInt f, const PetscScalar coefficients[], const PetscScalar coefficients_t[])
+  void evaluate(PetscInt f, const PetscScalar coefficients[], const PetscScalar coefficients_t[])
   {
     const ScalarBasis &basis = fields->basis[f];
-    const PetscInt n = basis.stride, C = basis.components, Nc = fields->total_components;
+    const PetscInt C = basis.components, Nc = fields->total_components;
     Vector8 node[max_nodes];
     const auto entry = [&](const PetscScalar *list, PetscInt a, PetscInt c) {
       return list && c < C ? list[basis.offset + a * C + c] : 0;
@@ -106,25 +139,18 @@ private:
                         entry(e_t, a, 0), entry(e_t, a, 1), entry(e_t, a, 2), 0};
     }
     for (PetscInt q = 0; q < fields->points; ++q) {
-      const PetscScalar *B = basis.values + q * n, *D = basis.derivatives + q * dim * n;
-      Vector8 s{}, s_0{}, s_1{}, s_2{}; // value, derivatives in the reference cell
-      for (PetscInt a = 0; a < basis.nodes; ++a) {
-        s += B[a] * node[a];
-        s_0 += D[a] * node[a];
-        s_1 += D[n + a] * node[a];
-        s_2 += D[2 * n + a] * node[a];
-      }
+      Vector8 s, g[dim];
+      interpolate(basis, q, inverse_J, node, s, g);
       PetscScalar *value = u + q * Nc + fields->uOff[f], *rate = u_t + q * Nc + fields->uOff[f];
       for (PetscInt c = 0; c < C; ++c) {
         value[c] = s[c];
         rate[c] = s[4 + c];
       }
       for (PetscInt d = 0; d < dim; ++d) {
-        const Vector8 g = inverse_J[d] * s_0 + inverse_J[dim + d] * s_1 + inverse_J[2 * dim + d] * s_2;
         const PetscInt place = q * Nc * dim + fields->uOff_x[f] + d;
         for (PetscInt c = 0; c < C; ++c) {
-          u_x[place + c * dim] = g[c];
-          rate_x[place + c * dim] = g[4 + c];
+          u_x[place + c * dim] = g[d][c];
+          rate_x[place + c * dim] = g[d][4 + c];
         }
       }
     }
