@@ -284,15 +284,33 @@ PetscErrorCode Archive::local(const std::string &name, Vec x)
 
 PetscErrorCode Archive::cells(const std::string &name, std::size_t width, std::vector<double> &values)
 {
+  PetscFunctionBeginUser;
+  if (!cell_order_.ready()) PetscCall(cell_order_.setup(model_.dm()));
+  PetscCall(ordered(name, cell_order_, width, values));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Archive::facets(const std::string &name, const std::string &surface, const std::vector<PetscInt> &facets,
+                               std::size_t width, std::vector<double> &values)
+{
+  PetscFunctionBeginUser;
+  CellOrder &order = facet_orders_[surface];
+  if (!order.ready()) PetscCall(order.setup(model_.dm(), facets));
+  PetscCall(ordered(name, order, width, values));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Archive::ordered(const std::string &name, const CellOrder &order, std::size_t width,
+                                std::vector<double> &values)
+{
   std::vector<double> all;
   bool good;
 
   PetscFunctionBeginUser;
-  if (!cell_order_.ready()) PetscCall(cell_order_.setup(model_.dm()));
-  if (!reading_) PetscCall(cell_order_.gather(width, values, all));
+  if (!reading_) PetscCall(order.gather(width, values, all));
   PetscCall(rows_on_root(name, width, all));
   if (!reading_) PetscFunctionReturn(PETSC_SUCCESS);
-  PetscCall(cell_order_.scatter(width, all, values, good));
+  PetscCall(order.scatter(width, all, values, good));
   PetscCall(check(good, name));
   PetscFunctionReturn(PETSC_SUCCESS);
 }

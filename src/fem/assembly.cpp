@@ -14,6 +14,8 @@ namespace pulmo {
 struct Assembly::Facets {
   PetscWeakForm wf = nullptr;
   PetscFormKey key{};
+  std::string surface;
+  std::vector<PetscInt> points;     ///< the mesh points
   std::vector<PetscInt> cells;      ///< the cell behind each facet
   std::vector<PetscReal> constants; ///< [facet][those that differ from place to place]
   PetscFEGeom *geom = nullptr;
@@ -42,10 +44,19 @@ PetscErrorCode Assembly::setup(DM dm, PetscDS rate_ds, const ParameterFields *va
 
 PetscErrorCode Assembly::remember(const PointMemory &memory)
 {
+  PetscInt n;
+  const PetscScalar *constants;
+
   PetscFunctionBeginUser;
   memory_ = &memory;
-  places_.memory_width = memory.width();
+  PetscCall(PetscDSGetConstants(ds_, &n, &constants));
+  place_memory_constant_ = constants::offset_of(constants::tag(PlaceMemory::owner), constants);
   PetscCall(PlaceData::attach(ds_, &places_));
+  for (const Facets *facets : facets_) {
+    const PointMemory::Room *room = memory.room(facets->surface);
+    PetscCheck(!room || room->facets() == facets->points, PETSC_COMM_SELF, PETSC_ERR_PLIB,
+               "memory and terms of surface %s differ in their facets", facets->surface.c_str());
+  }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -55,9 +66,7 @@ PetscErrorCode Assembly::setup_varying(const ParameterFields &fields)
   places_.offsets = fields.offsets();
   for (PetscInt c = 0; c < layout_.cells; ++c) fields.append(c, "", cell_constants_);
   for (Facets *facets : facets_) {
-    const char *surface;
-    PetscCall(PetscObjectGetName((PetscObject)facets->key.label, &surface));
-    for (const PetscInt cell : facets->cells) fields.append(cell, surface, facets->constants);
+    for (const PetscInt cell : facets->cells) fields.append(cell, facets->surface, facets->constants);
   }
   PetscCall(PlaceData::attach(ds_, &places_));
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -155,6 +164,7 @@ PetscErrorCode Assembly::setup_facets()
     DMLabel label;
     PetscInt n_values, field;
     const PetscInt *values;
+    const char *surface;
     PetscCall(PetscDSGetBoundary(ds_, b, &wf, &type, nullptr, &label, &n_values, &values, &field, nullptr, nullptr,
                                  nullptr, nullptr, nullptr));
     if (type != DM_BC_NATURAL) continue;
@@ -180,6 +190,9 @@ PetscErrorCode Assembly::setup_facets()
       facets_.push_back(facets);
       facets->wf = wf;
       facets->key = {label, values[v], field, 0};
+      PetscCall(PetscObjectGetName((PetscObject)label, &surface));
+      facets->surface = surface;
+      facets->points = faces;
       facets->cells = cells;
       PetscCall(
           ISCreateGeneral(PETSC_COMM_SELF, (PetscInt)faces.size(), faces.data(), PETSC_COPY_VALUES, faces_is.out()));
@@ -253,7 +266,7 @@ PetscErrorCode Assembly::for_blocks(Part part, Vec x, Vec x_t, PetscInt result_s
     std::fill(results.begin(), results.end(), 0.0);
     log_.timing = block % timed_share == 0;
     if (log_.timing) log_.timed_cells += n;
-    PetscCall(put_places(cell_constants_, true, begin));
+    PetscCall(put_places(cell_constants_, "", begin));
     PetscCall(on_cells(n, &geom, u.data(), u_t.data(), results.data()));
     for (PetscInt i = 0; i < n; ++i) PetscCall(scatter(begin + i, &results[i * result_size]));
   }
@@ -266,7 +279,7 @@ PetscErrorCode Assembly::for_blocks(Part part, Vec x, Vec x_t, PetscInt result_s
       for (PetscInt i = 0; i < n; ++i) gather(i, facets->cells[begin + i]);
       std::fill(results.begin(), results.end(), 0.0);
       PetscCall(PetscFEGeomGetChunk(facets->geom, begin, begin + n, &chunk));
-      PetscCall(put_places(facets->constants, false, begin));
+      PetscCall(put_places(facets->constants, facets->surface, begin));
       PetscCall(on_facets(*facets, n, chunk, u.data(), u_t.data(), results.data()));
       PetscCall(PetscFEGeomRestoreChunk(facets->geom, begin, begin + n, &chunk));
       for (PetscInt i = 0; i < n; ++i) PetscCall(scatter(facets->cells[begin + i], &results[i * result_size]));
@@ -279,24 +292,33 @@ PetscErrorCode Assembly::for_blocks(Part part, Vec x, Vec x_t, PetscInt result_s
 /// Other types of PetscFE know one set of constants for all places of a call.
 PetscInt Assembly::places_per_call() const
 {
-  return rate_ds_ && !places_.offsets.empty() ? 1 : block_cells;
+  return rate_ds_ && (!places_.offsets.empty() || memory_) ? 1 : block_cells;
 }
 
-/// Lets the next call find what is its places' own; the first of them is @p begin.
-PetscErrorCode Assembly::put_places(const std::vector<PetscReal> &rows, bool cells, PetscInt begin)
+/// Lets the next call find what is its places' own: cells, or the facets of @p surface; the first of them is @p begin.
+PetscErrorCode Assembly::put_places(const std::vector<PetscReal> &rows, const std::string &surface, PetscInt begin)
 {
   const std::size_t n = places_.offsets.size();
   PetscInt n_constants;
   const PetscScalar *constants;
 
   PetscFunctionBeginUser;
-  if (memory_) places_.memory = cells ? memory_->at(begin, 0) : Memory();
-  if (n == 0) PetscFunctionReturn(PETSC_SUCCESS);
-  places_.rows = &rows[static_cast<std::size_t>(begin) * n];
+  const PointMemory::Room *room = memory_ ? memory_->room(surface) : nullptr;
+  if (memory_) {
+    places_.memory = room ? room->at(begin, 0) : Memory();
+    places_.memory_width = room ? room->width() : 0;
+  }
+  if (n > 0) places_.rows = &rows[static_cast<std::size_t>(begin) * n];
   if (places_per_call() > 1) PetscFunctionReturn(PETSC_SUCCESS);
   PetscCall(PetscDSGetConstants(ds_, &n_constants, &constants));
   std::vector<PetscScalar> local(constants, constants + n_constants);
   for (std::size_t k = 0; k < n; ++k) local[static_cast<std::size_t>(places_.offsets[k])] = places_.rows[k];
+  if (memory_) {
+    place_memory_.first = places_.memory;
+    place_memory_.width = places_.memory_width;
+    if (room) room->coordinates(begin, place_memory_.x);
+    local[static_cast<std::size_t>(place_memory_constant_)] = constants::to_scalar<const PlaceMemory *>(&place_memory_);
+  }
   PetscCall(PetscDSSetConstants(ds_, n_constants, local.data()));
   PetscFunctionReturn(PETSC_SUCCESS);
 }

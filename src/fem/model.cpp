@@ -48,11 +48,7 @@ PetscErrorCode Model::build(Composition composition, PetscReal modulus)
   PetscCall(assembly_.setup(dm_, rate_ds, this->composition().varying()));
   row_scale_.assign(this->composition().fields().size(), 1);
   PetscCall(set_step(1, 0));
-  if (this->composition().memory_width() == 0) PetscFunctionReturn(PETSC_SUCCESS);
-  PulmoUserCheck(own_, PetscObjectComm((PetscObject)(DM)dm_),
-                 "effect %s remembers what happened at the points, which needs pulmo's own integration; leave "
-                 "-petscfe_type out",
-                 this->composition().memories().front().effect.c_str());
+  if (this->composition().memories().empty()) PetscFunctionReturn(PETSC_SUCCESS);
   memory_ = std::make_unique<PointMemory>();
   PetscCall(memory_->setup(*this));
   PetscCall(assembly_.remember(*memory_));

@@ -1,58 +1,102 @@
 #include "pulmo/fem/point_memory.hpp"
 
 #include "pulmo/fem/archive.hpp"
+#include "pulmo/mesh/mesh.hpp"
+
+#include <algorithm>
+#include <limits>
 
 namespace pulmo {
 
 PetscErrorCode PointMemory::setup(const Model &model)
 {
+  PetscSection section;
+  PetscInt size;
+
   PetscFunctionBeginUser;
   model_ = &model;
-  width_ = model.composition().memory_width();
   PetscCall(sampling_.setup(model));
-  points_ = static_cast<PetscInt>(model.assembly().relative_weights().size());
-  const std::size_t n = sampling_.cells().size() * static_cast<std::size_t>(points_ * width_);
-  last_.assign(n, 0);
-  next_.assign(n, 0);
-  PetscCall(evaluate(0, nullptr, nullptr, Step(Stage(1, 0, true)), true, last_));
+  for (const MemorySpec &spec : model.composition().memories())
+    if (!room(spec.surface)) PetscCall(add_room(spec.surface));
+  PetscCall(DMGetLocalSection(model.dm(), &section));
+  PetscCall(PetscSectionGetStorageSize(section, &size));
+  const std::vector<PetscScalar> zero(static_cast<std::size_t>(size), 0);
+  for (Room &r : rooms_) PetscCall(evaluate(0, zero.data(), nullptr, Step(Stage(1, 0, true)), true, r, r.last_));
   PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode PointMemory::add_room(const std::string &surface)
+{
+  const Mesh &mesh = model_->composition().mesh();
+  Room r;
+
+  PetscFunctionBeginUser;
+  r.memory_ = this;
+  r.surface_ = surface;
+  r.width_ = model_->composition().memory_width(surface);
+  for (const MemorySpec &spec : model_->composition().memories())
+    if (spec.surface == surface) r.specs_.push_back(&spec);
+  if (surface.empty()) {
+    r.places_ = sampling_.cells();
+    r.points_ = sampling_.points_of_cell();
+  } else {
+    PetscCall(sampling_.surface(mesh, surface, r.places_));
+    PetscCall(mesh.facets(surface, r.facets_));
+    r.points_ = sampling_.points_of_facet();
+  }
+  const std::size_t n = r.places_.size() * static_cast<std::size_t>(r.points_ * r.width_);
+  r.last_.assign(n, 0);
+  r.next_.assign(n, 0);
+  rooms_.push_back(std::move(r));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+const PointMemory::Room *PointMemory::room(const std::string &surface) const
+{
+  const auto found = std::find_if(rooms_.begin(), rooms_.end(), [&](const Room &r) { return r.surface_ == surface; });
+  return found == rooms_.end() ? nullptr : &*found;
 }
 
 std::size_t PointMemory::bytes() const
 {
-  return (last_.size() + earlier_.size() + middle_.size() + next_.size()) * sizeof(PetscScalar);
+  std::size_t sum = 0;
+  for (const Room &r : rooms_)
+    sum += (r.last_.size() + r.earlier_.size() + r.middle_.size() + r.next_.size()) * sizeof(PetscScalar);
+  return sum;
 }
 
-Memory PointMemory::at(PetscInt c, PetscInt q) const
+std::size_t PointMemory::bytes(const MemorySpec &spec) const
 {
-  const auto first = static_cast<std::size_t>((c * points_ + q) * width_);
-  const std::vector<PetscScalar> *other = past_ == Past::earlier  ? &earlier_
-                                          : past_ == Past::middle ? &middle_
-                                                                  : nullptr;
+  const Room &r = *room(spec.surface);
+  return (r.last_.size() + r.earlier_.size() + r.middle_.size() + r.next_.size()) * sizeof(PetscScalar) /
+         static_cast<std::size_t>(r.width_) * spec.quantities.size();
+}
+
+Memory PointMemory::Room::at(PetscInt i, PetscInt q) const
+{
+  const auto first = static_cast<std::size_t>((i * points_ + q) * width_);
+  const std::vector<PetscScalar> *other = memory_->past_ == Past::earlier  ? &earlier_
+                                          : memory_->past_ == Past::middle ? &middle_
+                                                                           : nullptr;
   return {last_.data() + first, other ? other->data() + first : nullptr};
 }
 
 PetscErrorCode PointMemory::evaluate(PetscReal t, const PetscScalar *x, const PetscScalar *rate, const Step &step,
-                                     bool start, std::vector<PetscScalar> &values)
+                                     bool start, Room &r, std::vector<PetscScalar> &values) const
 {
-  PetscSection section;
-  PetscInt size = 0;
   std::vector<PointSample> now, rates;
+  PetscScalar *value = values.data();
 
   PetscFunctionBeginUser;
-  PetscCall(DMGetLocalSection(model_->dm(), &section));
-  if (start) PetscCall(PetscSectionGetStorageSize(section, &size));
-  const std::vector<PetscScalar> zero(static_cast<std::size_t>(size), 0);
-  for (const Sampling::Element &e : sampling_.cells()) {
-    const PetscScalar *constants = model_->constants_at(e.cell);
-    sampling_.sample(e, start ? zero.data() : x, now);
+  for (std::size_t i = 0; i < r.places_.size(); ++i) {
+    const Sampling::Element &e = r.places_[i];
+    const PetscScalar *constants = model_->constants_at(e.cell, r.surface_);
+    sampling_.sample(e, x, now);
     if (!start) sampling_.sample(e, rate, rates);
-    for (PetscInt q = 0; q < points_; ++q) {
+    for (PetscInt q = 0; q < r.points_; ++q, value += r.width_) {
       if (!start) Sampling::take_rates(rates[q], now[q]);
-      const Point point = sampling_.point(now[q], e, t, step, start ? Memory() : at(e.cell, q));
-      PetscScalar *value = &values[static_cast<std::size_t>((e.cell * points_ + q) * width_)];
-      for (const MemorySpec &memory : model_->composition().memories())
-        memory.value(point, constants, value + memory.offset);
+      const Point point = sampling_.point(now[q], e, t, step, start ? Memory() : r.at(static_cast<PetscInt>(i), q));
+      for (const MemorySpec *spec : r.specs_) spec->value(point, constants, value + spec->offset);
     }
   }
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -61,30 +105,65 @@ PetscErrorCode PointMemory::evaluate(PetscReal t, const PetscScalar *x, const Pe
 PetscErrorCode PointMemory::compute(PetscReal t, Vec x, Vec rate)
 {
   PetscFunctionBeginUser;
-  next_.resize(last_.size());
   const ReadArray values(x), rates(rate);
-  PetscCall(evaluate(t, values.data(), rates.data(), model_->step(), false, next_));
+  for (Room &r : rooms_) {
+    r.next_.resize(r.last_.size());
+    PetscCall(evaluate(t, values.data(), rates.data(), model_->step(), false, r, r.next_));
+  }
   PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+void PointMemory::keep_middle()
+{
+  for (Room &r : rooms_) r.middle_.swap(r.next_);
 }
 
 void PointMemory::settle()
 {
   if (!pending_) return;
   pending_ = false;
-  earlier_.swap(last_);
-  last_.swap(next_);
+  two_ = true;
+  for (Room &r : rooms_) {
+    r.earlier_.swap(r.last_);
+    r.last_.swap(r.next_);
+  }
 }
 
 PetscErrorCode PointMemory::persist(Archive &archive, bool looks_back)
 {
   PetscFunctionBeginUser;
   if (!archive.reading()) settle();
-  const auto width = static_cast<std::size_t>(points_ * width_);
-  PetscCall(archive.cells("memory/last", width, last_));
-  bool two = looks_back && !earlier_.empty();
-  PetscCall(archive.value("memory/two", two));
-  if (two) PetscCall(archive.cells("memory/earlier", width, earlier_));
+  two_ = two_ && looks_back;
+  PetscCall(archive.value("memory/two", two_));
+  for (Room &r : rooms_) {
+    const auto width = static_cast<std::size_t>(r.points_ * r.width_);
+    const std::string name = r.surface_.empty() ? "memory" : "memory/of_" + r.surface_;
+    const auto visit = [&](const std::string &which, std::vector<PetscScalar> &values) {
+      return r.surface_.empty() ? archive.cells(name + which, width, values)
+                                : archive.facets(name + which, r.surface_, r.facets_, width, values);
+    };
+    PetscCall(visit("/last", r.last_));
+    if (two_) PetscCall(visit("/earlier", r.earlier_));
+  }
   PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+void PointMemory::means(const MemorySpec &spec, std::size_t index, std::vector<PetscScalar> &values) const
+{
+  const Room &r = *room(spec.surface);
+  const std::vector<PetscScalar> &state = pending_ ? r.next_ : r.last_;
+  std::vector<PetscReal> measure(static_cast<std::size_t>(model_->assembly().cells()), 0);
+
+  values.assign(measure.size(), 0);
+  std::size_t at = static_cast<std::size_t>(spec.offset) + index;
+  for (const Sampling::Element &e : r.places_) {
+    const std::vector<PetscReal> &weights = sampling_.weights(e);
+    measure[e.cell] += e.measure;
+    for (PetscInt q = 0; q < r.points_; ++q, at += static_cast<std::size_t>(r.width_))
+      values[e.cell] += weights[q] * e.measure * state[at];
+  }
+  for (std::size_t c = 0; c < values.size(); ++c)
+    values[c] = measure[c] > 0 ? values[c] / measure[c] : std::numeric_limits<PetscScalar>::quiet_NaN();
 }
 
 } // namespace pulmo

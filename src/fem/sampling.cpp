@@ -28,6 +28,15 @@ PetscErrorCode rule_points(PetscQuadrature rule, std::vector<PetscReal> &xi, std
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+/// Where point @p xi of the reference cell is, mm.
+void take_to_mesh(const Sampling::Element &e, const PetscReal xi[3], PetscReal x[3])
+{
+  for (int d = 0; d < 3; ++d) {
+    x[d] = e.v0[d];
+    for (int i = 0; i < 3; ++i) x[d] += e.J[3 * d + i] * (xi[i] + 1);
+  }
+}
+
 /// Gradients (4 x 3, 1/mm) of the barycentric coordinates of a cell.
 void barycentric_gradients(const PetscReal inverse[9], PetscReal g[12])
 {
@@ -47,6 +56,9 @@ PetscErrorCode Sampling::setup(const Model &model)
   PetscDS ds;
   PetscFE fe;
   PetscQuadrature rule, face_rule;
+  PetscDualSpace space;
+  DM reference;
+  const PetscInt *faces;
   PetscInt begin, end;
   std::vector<PetscReal> xi, eta, weights, face_weights;
 
@@ -70,18 +82,17 @@ PetscErrorCode Sampling::setup(const Model &model)
   PetscCall(PetscFEGetFaceQuadrature(fe, &face_rule));
   PetscCall(rule_points(rule, xi, weights));
   PetscCall(add_table(xi, weights));
-  // the rule of the faces is symmetric: any order of a face's corners gives the same points
   PetscCall(rule_points(face_rule, eta, face_weights));
-  for (int opposite = 0; opposite < 4; ++opposite) {
+  PetscCall(PetscFEGetDualSpace(fe, &space));
+  PetscCall(PetscDualSpaceGetDM(space, &reference));
+  PetscCall(DMPlexGetCone(reference, 0, &faces));
+  for (int f = 0; f < 4; ++f) { // as PETSc tabulates them
+    PetscReal v0[3], R[9], inverse[9], det;
+    PetscCall(DMPlexComputeCellGeometryFEM(reference, faces[f], nullptr, v0, R, inverse, &det));
     xi.clear();
-    for (std::size_t q = 0; q < face_weights.size(); ++q) {
-      const PetscReal a = (eta[2 * q] + 1) / 2, b = (eta[2 * q + 1] + 1) / 2;
-      PetscReal lambda[4] = {0, 0, 0, 0};
-      lambda[(opposite + 1) % 4] = 1 - a - b;
-      lambda[(opposite + 2) % 4] = a;
-      lambda[(opposite + 3) % 4] = b;
-      for (int d = 0; d < 3; ++d) xi.push_back(2 * lambda[d + 1] - 1);
-    }
+    for (std::size_t q = 0; q < face_weights.size(); ++q)
+      for (int d = 0; d < 3; ++d)
+        xi.push_back(v0[d] + R[3 * d] * (eta[2 * q] + 1) + R[3 * d + 1] * (eta[2 * q + 1] + 1));
     PetscCall(add_table(xi, face_weights));
   }
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -117,7 +128,7 @@ PetscErrorCode Sampling::surface(const Mesh &mesh, const std::string &name, std:
   PetscCall(DMPlexGetHeightStratum(dm_, 0, &cell_begin, nullptr));
   PetscCall(mesh.facets(name, points));
   for (PetscInt point : points) {
-    const PetscInt *support;
+    const PetscInt *support, *faces;
     PetscReal area, centre[3], gradients[12], least = PETSC_MAX_REAL;
     PetscCall(DMPlexGetSupport(dm_, point, &support));
     PetscCall(DMPlexComputeCellGeometryFVM(dm_, point, &area, centre, nullptr));
@@ -133,7 +144,8 @@ PetscErrorCode Sampling::surface(const Mesh &mesh, const std::string &name, std:
       }
     }
     const PetscReal *g = &gradients[3 * opposite], slope = std::hypot(g[0], g[1], g[2]);
-    e.table = 1 + opposite;
+    PetscCall(DMPlexGetCone(dm_, support[0], &faces));
+    e.table = 1 + static_cast<PetscInt>(std::find(faces, faces + 4, point) - faces);
     e.measure = area;
     for (int d = 0; d < 3; ++d) e.normal[d] = -g[d] / slope;
     facets.push_back(e);
@@ -167,10 +179,17 @@ void Sampling::sample(const Element &e, const PetscScalar *x, std::vector<PointS
     for (int d = 0; d < 3; ++d) {
       s.grad_p[d] = gradient[d][0];
       s.u_t[d] = s.grad_p_t[d] = 0;
-      s.x[d] = e.v0[d];
-      for (int i = 0; i < 3; ++i) s.x[d] += e.J[3 * d + i] * (t.xi[3 * q + i] + 1);
     }
+    take_to_mesh(e, &t.xi[3 * q], s.x);
   }
+}
+
+void Sampling::coordinates(const Element &e, std::vector<PetscReal> &x) const
+{
+  const Table &t = tables_[e.table];
+
+  x.resize(t.xi.size());
+  for (std::size_t q = 0; q < t.weights.size(); ++q) take_to_mesh(e, &t.xi[3 * q], &x[3 * q]);
 }
 
 void Sampling::make_rates(const PointSample &before, PetscReal dt, PointSample &now)

@@ -8,50 +8,82 @@
 
 namespace pulmo {
 
-namespace {
-
-/// The corners of a cell in the order of their coordinates.
-using Key = std::array<double, 12>;
-
-PetscErrorCode find_key(DM dm, PetscInt cell, Key &key)
+PetscErrorCode CellOrder::find_key(DM dm, PetscInt cell, PetscInt facet, Key &key)
 {
-  PetscInt begin, end, n, *closure = nullptr;
-  std::array<std::array<PetscReal, 3>, 4> corners{};
-  std::size_t found = 0;
+  using Corner = std::array<PetscReal, 3>;
+  PetscInt begin, end;
+  std::vector<Corner> corners, of_facet;
 
   PetscFunctionBeginUser;
   PetscCall(DMPlexGetDepthStratum(dm, 0, &begin, &end));
-  PetscCall(DMPlexGetTransitiveClosure(dm, cell, PETSC_TRUE, &n, &closure));
-  for (PetscInt i = 0; i < n; ++i)
-    if (closure[2 * i] >= begin && closure[2 * i] < end && found < corners.size())
-      PetscCall(node_coordinates(dm, closure[2 * i], corners[found++].data()));
-  PetscCall(DMPlexRestoreTransitiveClosure(dm, cell, PETSC_TRUE, &n, &closure));
+  const auto collect = [&](PetscInt point, std::vector<Corner> &list) -> PetscErrorCode {
+    PetscInt n, *closure = nullptr;
+    PetscFunctionBeginUser;
+    PetscCall(DMPlexGetTransitiveClosure(dm, point, PETSC_TRUE, &n, &closure));
+    for (PetscInt i = 0; i < n; ++i) {
+      if (closure[2 * i] < begin || closure[2 * i] >= end) continue;
+      list.emplace_back();
+      PetscCall(node_coordinates(dm, closure[2 * i], list.back().data()));
+    }
+    PetscCall(DMPlexRestoreTransitiveClosure(dm, point, PETSC_TRUE, &n, &closure));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  };
+  PetscCall(collect(cell, corners));
   std::sort(corners.begin(), corners.end());
+  key = {};
   for (std::size_t i = 0; i < 12; ++i) key[i] = corners[i / 3][i % 3];
+  if (facet < 0) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(collect(facet, of_facet));
+  const auto lacks = std::find_if(corners.begin(), corners.end(), [&](const Corner &c) {
+    return std::find(of_facet.begin(), of_facet.end(), c) == of_facet.end();
+  });
+  key[12] = static_cast<double>(lacks - corners.begin());
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-} // namespace
-
 PetscErrorCode CellOrder::setup(DM dm)
 {
-  const MPI_Comm comm = PetscObjectComm((PetscObject)dm);
   PetscInt begin, end;
-  std::vector<Key> mine, all;
+  std::vector<Key> mine;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMPlexGetHeightStratum(dm, 0, &begin, &end));
+  for (PetscInt c = begin; c < end; ++c) { // cells are not shared: pulmo distributes without overlap
+    mine.emplace_back();
+    PetscCall(find_key(dm, c, -1, mine.back()));
+  }
+  PetscCall(sort(dm, mine));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode CellOrder::setup(DM dm, const std::vector<PetscInt> &facets)
+{
+  std::vector<Key> mine;
+
+  PetscFunctionBeginUser;
+  for (const PetscInt facet : facets) {
+    const PetscInt *support;
+    PetscCall(DMPlexGetSupport(dm, facet, &support));
+    mine.emplace_back();
+    PetscCall(find_key(dm, support[0], facet, mine.back()));
+  }
+  PetscCall(sort(dm, mine));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode CellOrder::sort(DM dm, const std::vector<Key> &mine)
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)dm);
+  std::vector<Key> all;
   std::vector<PetscMPIInt> counts, starts;
   MPI_Datatype type;
 
   PetscFunctionBeginUser;
   dm_ = dm;
-  PetscCall(DMPlexGetHeightStratum(dm, 0, &begin, &end));
-  for (PetscInt c = begin; c < end; ++c) { // cells are not shared: pulmo distributes without overlap
-    cells_.push_back(c);
-    mine.emplace_back();
-    PetscCall(find_key(dm, c, mine.back()));
-  }
+  mine_ = mine.size();
   PetscCall(layout(1, counts, starts));
   if (!counts.empty()) all.resize(static_cast<std::size_t>(starts.back()) + static_cast<std::size_t>(counts.back()));
-  PetscCallMPI(MPI_Type_contiguous(12, MPI_DOUBLE, &type));
+  PetscCallMPI(MPI_Type_contiguous(static_cast<int>(std::tuple_size_v<Key>), MPI_DOUBLE, &type));
   PetscCallMPI(MPI_Type_commit(&type));
   PetscCallMPI(MPI_Gatherv(mine.data(), static_cast<PetscMPIInt>(mine.size()), type, all.data(), counts.data(),
                            starts.data(), type, 0, comm));
@@ -73,7 +105,7 @@ PetscErrorCode CellOrder::layout(std::size_t width, std::vector<PetscMPIInt> &co
   PetscFunctionBeginUser;
   PetscCallMPI(MPI_Comm_rank(comm, &rank));
   PetscCallMPI(MPI_Comm_size(comm, &size));
-  PetscCall(PetscMPIIntCast(static_cast<PetscInt>(width * cells_.size()), &n));
+  PetscCall(PetscMPIIntCast(static_cast<PetscInt>(width * mine_), &n));
   counts.assign(rank == 0 ? size : 0, 0);
   PetscCallMPI(MPI_Gather(&n, 1, MPI_INT, counts.data(), 1, MPI_INT, 0, comm));
   starts.resize(counts.size());
@@ -110,7 +142,7 @@ PetscErrorCode CellOrder::scatter(std::size_t width, const std::vector<double> &
   PetscCall(layout(width, counts, starts));
   std::vector<double> sent(all.size());
   for (std::size_t c = 0; c < place_.size(); ++c) std::copy_n(&all[place_[c] * width], width, &sent[c * width]);
-  mine.resize(width * cells_.size());
+  mine.resize(width * mine_);
   PetscCallMPI(MPI_Scatterv(sent.data(), counts.data(), starts.data(), MPI_DOUBLE, mine.data(),
                             static_cast<PetscMPIInt>(mine.size()), MPI_DOUBLE, 0, comm));
   PetscFunctionReturn(PETSC_SUCCESS);

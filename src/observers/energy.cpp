@@ -134,15 +134,16 @@ PetscErrorCode EnergyAudit::integrate(const Part &part, const StepReport &step, 
   step_now.gas_pressure = step.row.pressure * units::kPa_per_cmH2O;
   step_before.gas_pressure = gas_pressure_;
   const ReadArray x(step.local), x_before(before_);
-  for (const Sampling::Element &e : part.elements) {
+  const PointMemory::Room *room = model_.memory() ? model_.memory()->room(part.surface) : nullptr;
+  for (std::size_t i = 0; i < part.elements.size(); ++i) {
+    const Sampling::Element &e = part.elements[i];
     const auto &weights = sampling_.weights(e);
     const PetscScalar *constants = model_.constants_at(e.cell, part.surface);
     sampling_.sample(e, x.data(), now);
     sampling_.sample(e, x_before.data(), before);
     for (std::size_t q = 0; q < weights.size(); ++q) {
       Sampling::make_rates(before[q], dt, now[q]);
-      const Memory memory =
-          model_.memory() && part.surface.empty() ? model_.memory()->at(e.cell, static_cast<PetscInt>(q)) : Memory();
+      const Memory memory = room ? room->at(static_cast<PetscInt>(i), static_cast<PetscInt>(q)) : Memory();
       const Point a = sampling_.point(now[q], e, t, step_now, memory),
                   b = sampling_.point(before[q], e, t - dt, step_before, memory);
       for (std::size_t k = 0; k < part.terms.size(); ++k)

@@ -237,10 +237,9 @@ PetscErrorCode print_ledger(MPI_Comm comm, const Scene &scene, const Model &mode
                  fields[c.field].name + ")";
     for (const MemorySpec &m : composition.memories())
       if (m.effect == name)
-        terms += "\n    remembers " + std::to_string(m.quantities.size()) + " quantities at each point of a cell (" +
-                 std::to_string(m.quantities.size() * model.memory()->bytes() /
-                                static_cast<std::size_t>(composition.memory_width())) +
-                 " bytes on this rank)";
+        terms += "\n    remembers " + std::to_string(m.quantities.size()) + " quantities at each point of " +
+                 (m.surface.empty() ? "a cell" : "a facet of " + m.surface) + " (" +
+                 std::to_string(model.memory()->bytes(m)) + " bytes on this rank)";
     for (const ScalarGroup &group : composition.scalar_groups())
       if (group.effect == name)
         for (const ScalarSpec &s : group.scalars)

@@ -6,6 +6,60 @@
 
 namespace pulmo {
 
+namespace {
+
+bool same_owner(const char *a, const char *b)
+{
+  return a && b && constants::tag(a) == constants::tag(b);
+}
+
+} // namespace
+
+Memory PlaceMemory::nearest(const PetscReal at[3]) const
+{
+  PetscInt best = 0;
+  PetscReal least = PETSC_MAX_REAL;
+
+  for (PetscInt q = 0; q < static_cast<PetscInt>(x.size() / 3); ++q) {
+    PetscReal square = 0;
+    for (int d = 0; d < 3; ++d) square += (x[3 * q + d] - at[d]) * (x[3 * q + d] - at[d]);
+    if (square < least) {
+      least = square;
+      best = q;
+    }
+  }
+  return {first.last + best * width, first.earlier ? first.earlier + best * width : nullptr};
+}
+
+Memory PlaceMemory::find(const PetscReal at[3], const PetscScalar c[])
+{
+  const PetscInt offset = constants::offset_of(constants::tag(owner), c);
+  if (offset == 0) return {};
+  const auto *place = constants::to_pointer<const PlaceMemory *>(c[offset]);
+  return place && place->first.last ? place->nearest(at) : Memory();
+}
+
+void Composition::remember(std::vector<Quantity> quantities, Callback<MemoryFunction> value, const std::string &surface)
+{
+  PetscInt offset = 0;
+
+  for (const MemorySpec &m : memories_)
+    if (m.surface.empty() == surface.empty())
+      offset = std::max(offset, m.offset + static_cast<PetscInt>(m.quantities.size()));
+  for (const MemorySpec &m : memories_) // kernels know one place for all surfaces
+    if (!m.surface.empty() && !surface.empty() && same_owner(m.owner, value.owners[0])) offset = m.offset;
+  memories_.push_back({effect_, surface, value.owners[0], std::move(quantities), value.function, offset});
+  note_readers(effect_, "memory", surface, value.owners);
+}
+
+PetscInt Composition::memory_width(const std::string &surface) const
+{
+  PetscInt width = 0;
+  for (const MemorySpec &m : memories_)
+    if (m.surface == surface) width = std::max(width, m.offset + static_cast<PetscInt>(m.quantities.size()));
+  return width;
+}
+
 PetscErrorCode Composition::check_parameters(MPI_Comm comm) const
 {
   PetscFunctionBeginUser;
@@ -21,12 +75,28 @@ PetscErrorCode Composition::check_parameters(MPI_Comm comm) const
                "effect %s: the parameters of '%s' are handed over %d times; give each block an owner of its own",
                reader.effect.c_str(), reader.owner, (int)n);
   }
+  for (const MemorySpec &m : memories_) {
+    PetscCheck(m.owner, comm, PETSC_ERR_ARG_WRONGSTATE,
+               "effect %s remembers by a kernel without parameters, which cannot see it; give it a struct of "
+               "parameters",
+               m.effect.c_str());
+    for (const MemorySpec &other : memories_) {
+      if (&m == &other || m.surface.empty() != other.surface.empty()) continue;
+      if (!same_owner(m.owner, other.owner)) continue;
+      PetscCheck(m.surface != other.surface && m.quantities.size() == other.quantities.size(), comm,
+                 PETSC_ERR_ARG_WRONGSTATE,
+                 "effect %s: what kernels with the parameters of '%s' remember has two meanings; call "
+                 "Composition::remember once for the cells and once for each surface, with the same quantities on all "
+                 "surfaces",
+                 m.effect.c_str(), m.owner);
+    }
+  }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
 PetscInt Composition::constant_at(const PetscReal *parameter, const char **owner) const
 {
-  PetscInt offset = 1 + 2 * static_cast<PetscInt>(1 + parameters_.size() + memories_.size()) +
+  PetscInt offset = 1 + 2 * constant_blocks() +
                     static_cast<PetscInt>(sizeof(Step) / sizeof(PetscScalar)); // as constants() lists them
   for (const ParameterBlock &block : parameters_) {
     if (!std::less<>()(parameter, block.data) && std::less<>()(parameter, block.data + block.count)) {
@@ -49,9 +119,9 @@ std::vector<std::string> Composition::surfaces_that_read(const char *owner) cons
 
 std::vector<PetscScalar> Composition::constants(const Step &step) const
 {
-  const std::size_t blocks = 1 + parameters_.size() + memories_.size();
+  const PetscInt blocks = constant_blocks();
   std::vector<PetscScalar> all(1, static_cast<PetscScalar>(blocks));
-  auto offset = static_cast<PetscInt>(1 + 2 * blocks);
+  PetscInt offset = 1 + 2 * blocks;
   const auto list = [&](PetscScalar tag, PetscInt count) {
     all.push_back(tag);
     all.push_back(static_cast<PetscScalar>(offset));
@@ -63,10 +133,12 @@ std::vector<PetscScalar> Composition::constants(const Step &step) const
   // the step is asked for by every kernel: first in the directory
   list(constants::tag(Step::owner), step_size);
   for (const ParameterBlock &block : parameters_) list(constants::tag(block.owner), block.count);
-  for (const MemorySpec &memory : memories_) list(constants::memory_tag(memory.owner), 1);
+  for (const MemorySpec &memory : memories_) list(constants::memory_tag(memory.owner, !memory.surface.empty()), 1);
+  if (!memories_.empty()) list(constants::tag(PlaceMemory::owner), 1);
   all.insert(all.end(), of_step, of_step + step_size);
   for (const ParameterBlock &block : parameters_) all.insert(all.end(), block.data, block.data + block.count);
   for (const MemorySpec &memory : memories_) all.push_back(static_cast<PetscScalar>(memory.offset));
+  if (!memories_.empty()) all.push_back(constants::to_scalar<const PlaceMemory *>(nullptr));
   return all;
 }
 

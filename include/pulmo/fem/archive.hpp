@@ -100,6 +100,9 @@ public:
   PetscErrorCode local(const std::string &name, Vec x);
   /// @p width numbers for each cell of this rank, [cell][number].
   PetscErrorCode cells(const std::string &name, std::size_t width, std::vector<double> &values);
+  /// The same for @p facets of this rank, those of surface @p surface.
+  PetscErrorCode facets(const std::string &name, const std::string &surface, const std::vector<PetscInt> &facets,
+                        std::size_t width, std::vector<double> &values);
   /// A global vector; what is constrained is not in it.
   PetscErrorCode global(const std::string &name, Vec X);
   /// User error unless @p good (the same on all ranks): the file does not hold @p name as this program needs it.
@@ -110,6 +113,9 @@ private:
   PetscErrorCode scalar(const std::string &name, double &number);
   /// Rows of @p width numbers that rank 0 alone has, and reads.
   PetscErrorCode rows_on_root(const std::string &name, std::size_t width, std::vector<double> &values);
+  /// Rows that travel in @p order.
+  PetscErrorCode ordered(const std::string &name, const CellOrder &order, std::size_t width,
+                         std::vector<double> &values);
   /// @p n rows, equally long.
   PetscErrorCode numbers(const std::string &name, std::size_t &n, std::vector<double> &values);
   /// The same as check(), but rank 0 alone knows.
@@ -117,7 +123,8 @@ private:
 
   const Model &model_;
   const NodeOrder &order_;
-  CellOrder cell_order_; ///< made when it is needed
+  CellOrder cell_order_;                          ///< made when it is needed
+  std::map<std::string, CellOrder> facet_orders_; ///< [surface]
   MPI_Comm comm_;
   bool root_, reading_, good_ = true;
   std::string option_, path_; ///< of a file that is read

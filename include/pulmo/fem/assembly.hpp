@@ -34,7 +34,7 @@ public:
   virtual PetscErrorCode begin() = 0;
   /// Adds cell @p c (counted from 0) from its element matrix, rows scaled by @p row_scale.
   virtual PetscErrorCode add(PetscInt c, const PetscScalar *matrix, const PetscReal row_scale[]) = 0;
-  /// Completes it; @p closed: mesh points whose pressure is held.
+  /// Completes it; @p closed: mesh points whose pressure is held. Collective.
   virtual PetscErrorCode end(const std::vector<PetscInt> &closed) = 0;
 };
 
@@ -57,18 +57,18 @@ public:
   /// @p rate_ds: for PetscFE types other than pulmo's, the PetscDS of the auxiliary field that carries x_t. @p varying:
   /// parameters that differ from place to place, or null.
   PetscErrorCode setup(DM dm, PetscDS rate_ds, const ParameterFields *varying);
-  /// What kernels in the cells remember; must outlive this.
+  /// What kernels remember; must outlive this.
   PetscErrorCode remember(const PointMemory &memory);
 
   /// Adds the residual of the local vectors @p x and @p x_t to F; rows of field f are multiplied by row_scale[f].
   PetscErrorCode residual(Part part, PetscReal t, Vec x, Vec x_t, const PetscReal row_scale[], Vec F);
   /// A = dF/dx + shift dF/dx_t, rows scaled alike; Part::facets adds to A.
-  /// With @p also the element matrices of the cells go there too.
+  /// With @p also the element matrices of the cells go there too. Collective.
   PetscErrorCode jacobian(Part part, PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[], Mat A,
                           CellMatrices *also = nullptr);
-  /// J and its integral for the local vector @p x.
+  /// J and its integral for the local vector @p x. Collective.
   PetscErrorCode measure(Vec x, Measures &measures) const;
-  /// int cof F(x) : Grad y, the derivative of int (J - 1) in direction @p y, mm^3.
+  /// int cof F(x) : Grad y, the derivative of int (J - 1) in direction @p y, mm^3. Collective.
   PetscErrorCode volume_derivative(Vec x, Vec y, PetscReal &derivative) const;
 
   /// Kinematic states at the quadrature points, then the corners, of cell @p c (counted from 0).
@@ -91,7 +91,7 @@ private:
   PetscErrorCode for_blocks(Part part, Vec x, Vec x_t, PetscInt result_size, OnCells &&on_cells, OnFacets &&on_facets,
                             Scatter &&scatter);
   PetscInt places_per_call() const;
-  PetscErrorCode put_places(const std::vector<PetscReal> &rows, bool cells, PetscInt begin);
+  PetscErrorCode put_places(const std::vector<PetscReal> &rows, const std::string &surface, PetscInt begin);
   PetscFEGeom block_geometry(PetscInt begin, PetscInt n);
 
   DM dm_ = nullptr; ///< not owned
@@ -106,6 +106,8 @@ private:
   MatrixMap map_;
   PlaceData places_;
   const PointMemory *memory_ = nullptr;
+  PlaceMemory place_memory_;              ///< of the place at hand, for PetscFE types other than pulmo's
+  PetscInt place_memory_constant_ = 0;    ///< where its address is among the constants
   std::vector<PetscReal> cell_constants_; ///< [cell][those that differ]
   IntegrationLog log_;
 };

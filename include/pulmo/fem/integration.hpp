@@ -39,8 +39,8 @@ struct IntegrationLog {
 struct PlaceData {
   std::vector<PetscInt> offsets;   ///< which of the constants of PetscDS
   const PetscReal *rows = nullptr; ///< [place of the call][offset]: their values
-  Memory memory;                   ///< of the first point of the first cell; null on facets
-  PetscInt memory_width = 0;       ///< scalars of a point; [cell][point][width]
+  Memory memory;                   ///< of the first point of the first place; null where nothing is remembered
+  PetscInt memory_width = 0;       ///< scalars of a point; [place][point][width]
 
   static PetscErrorCode attach(PetscDS ds, PlaceData *places);
   /// Those of @p ds, or null.

@@ -27,7 +27,7 @@ struct CellLayout {
 /// per pair of mesh points of a cell is enough. Rows of other ranks are summed here and sent once.
 class MatrixMap {
 public:
-  /// Positions in @p A for the cells of @p layout, which must outlive this. Returns at once if @p A is known.
+  /// Positions in @p A for the cells of @p layout, which must outlive this; once for each matrix. Collective.
   PetscErrorCode setup(DM dm, const CellLayout &layout, Mat A);
   /// Opens A; add() comes next.
   PetscErrorCode begin();

@@ -101,7 +101,7 @@ private:
   PetscErrorCode pack_constants();
   PetscErrorCode add_volume_terms(PetscDS ds) const;
   /// PETSc's own loops over cells: constants are the same everywhere there.
-  bool stock_loops() const { return !own_ && !composition().varying(); }
+  bool stock_loops() const { return !own_ && !composition().varying() && !memory_; }
   PetscErrorCode create_stock();
   PetscErrorCode stock_residual(PetscReal t, Vec x, Vec x_t, Vec F);
   PetscErrorCode stock_jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, Mat A);

@@ -16,13 +16,13 @@ struct PointSample {
   PetscScalar u_t[3], p_t, grad_p_t[3]; ///< rates, as that in the state: of make_rates(), else 0
 };
 
-/// The points of the model's own rules, so that integrals match the weak form term by term.
+/// The points of the model's own rules in the integrator's order, so that integrals match the weak form term by term.
 class Sampling {
 public:
   /// A cell, or a facet with the cell behind it.
   struct Element {
     PetscInt cell;         ///< on this rank, counted from 0
-    PetscInt table;        ///< which of the rules: 0 that of cells, then those of the faces
+    PetscInt table;        ///< which of the rules: 0 that of cells, then those of the faces as a cell counts them
     PetscReal measure;     ///< volume or area, reference configuration, mm^3 or mm^2
     PetscReal normal[3];   ///< outward unit normal (facets only)
     PetscReal v0[3], J[9]; ///< x = v0 + J (xi + 1)
@@ -36,6 +36,10 @@ public:
   PetscErrorCode surface(const Mesh &mesh, const std::string &name, std::vector<Element> &facets) const;
   /// Weights of the points of @p element, summing to its measure when multiplied with it.
   const std::vector<PetscReal> &weights(const Element &element) const { return tables_[element.table].weights; }
+  PetscInt points_of_cell() const { return static_cast<PetscInt>(tables_.front().weights.size()); }
+  PetscInt points_of_facet() const { return static_cast<PetscInt>(tables_.back().weights.size()); }
+  /// Where the points of @p element are, [point][3], mm.
+  void coordinates(const Element &element, std::vector<PetscReal> &x) const;
   /// States at the points of @p element for the local vector @p x.
   void sample(const Element &element, const PetscScalar *x, std::vector<PointSample> &samples) const;
   /// Gives @p now the rates that backward Euler finds in it after @p before, @p dt seconds earlier.
@@ -46,8 +50,19 @@ public:
   Point point(const PointSample &sample, const Element &element, PetscReal t, const Step &step,
               const Memory &memory = {}) const
   {
-    return {sample.state, sample.u,   sample.p,   gas_ ? sample.grad_p : nullptr,   t,     0, sample.x, element.normal,
-            step,         sample.u_t, sample.p_t, gas_ ? sample.grad_p_t : nullptr, memory};
+    return {sample.state,
+            sample.u,
+            sample.p,
+            gas_ ? sample.grad_p : nullptr,
+            t,
+            0,
+            sample.x,
+            element.table > 0 ? element.normal : nullptr,
+            step,
+            sample.u_t,
+            sample.p_t,
+            gas_ ? sample.grad_p_t : nullptr,
+            memory};
   }
 
 private:

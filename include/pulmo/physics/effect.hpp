@@ -155,7 +155,7 @@ struct ParameterBlock {
   PetscInt count;
 };
 
-/// A quantity that an effect remembers at the points of the cells.
+/// A quantity that an effect remembers at the points of the cells, or of the facets of a surface.
 struct Quantity {
   std::string name, unit;
 };
@@ -163,7 +163,8 @@ struct Quantity {
 /// What one effect remembers there.
 struct MemorySpec {
   std::string effect;
-  const char *owner; ///< of the parameters of its kernels
+  std::string surface; ///< empty: in the cells
+  const char *owner;   ///< of the parameters of its kernels
   std::vector<Quantity> quantities;
   MemoryFunction value; ///< what they are in a state
   PetscInt offset = 0;  ///< among the scalars of a point
@@ -226,21 +227,14 @@ public:
     energies_.push_back({effect_, kind, account, surface, density.function});
     note_readers(effect_, account, surface, density.owners);
   }
-  /// Lets an effect remember quantities at the points of the cells. @p value computes all of them from a state, of
-  /// which the effect sees those before in Point::memory and Point::past(); it is called once for an accepted step, and
-  /// at the start (memory.last is null then). Kernels whose parameters have the same owner see what is remembered.
-  void remember(std::vector<Quantity> quantities, Callback<MemoryFunction> value)
-  {
-    const PetscInt offset = memory_width();
-    memories_.push_back({effect_, value.owners[0], std::move(quantities), value.function, offset});
-    note_readers(effect_, "memory", "", value.owners);
-  }
+  /// Lets an effect remember quantities at the points of the cells, or of the facets of @p surface. @p value computes
+  /// all of them from a state, of which the effect sees those before in Point::memory and Point::past(); it is called
+  /// once for an accepted step, and at the start (memory.last is null then). Kernels there whose parameters have the
+  /// same owner see what is remembered. An effect that remembers on several surfaces remembers the same on each.
+  void remember(std::vector<Quantity> quantities, Callback<MemoryFunction> value, const std::string &surface = "");
   const std::vector<MemorySpec> &memories() const { return memories_; }
-  /// Scalars that are remembered at a point.
-  PetscInt memory_width() const
-  {
-    return memories_.empty() ? 0 : memories_.back().offset + static_cast<PetscInt>(memories_.back().quantities.size());
-  }
+  /// Scalars that are remembered at a point of a cell, or of a facet of @p surface.
+  PetscInt memory_width(const std::string &surface = "") const;
   /// Adds scalar unknowns and as many equations.
   void scalars(std::vector<ScalarSpec> list, ScalarEquations equations)
   {
@@ -315,12 +309,18 @@ public:
   PetscInt constant_at(const PetscReal *parameter, const char **owner) const;
   /// The surfaces on which terms read the parameters of @p owner.
   std::vector<std::string> surfaces_that_read(const char *owner) const;
-  /// Refuses terms that read parameters which no effect hands over, or two hand over: an error in an effect's code.
+  /// Refuses terms that read parameters which no effect hands over, or two hand over, and memories that cannot be told
+  /// apart: errors in an effect's code.
   PetscErrorCode check_parameters(MPI_Comm comm) const;
   /// Constants of PetscDS for a step: those of the step and of all effects, under a directory.
   std::vector<PetscScalar> constants(const Step &step) const;
 
 private:
+  /// Entries of the directory of constants().
+  PetscInt constant_blocks() const
+  {
+    return static_cast<PetscInt>(1 + parameters_.size() + (memories_.empty() ? 0 : memories_.size() + 1));
+  }
   /// Whether a term resists displacement itself.
   static bool resists(const Term &t) { return t.test == displacement && t.trial == displacement && (t.g0 || t.bd_g0); }
   Term term(const std::string &name, const std::string &surface, PetscInt test, PetscInt trial) const

@@ -18,6 +18,7 @@
 #include <cstring>
 #include <string_view>
 #include <type_traits>
+#include <vector>
 
 namespace pulmo {
 
@@ -59,6 +60,15 @@ constexpr PetscScalar tag(std::string_view name)
   return static_cast<PetscScalar>(h >> 14);
 }
 
+/// Where the block with a tag begins; 0: there is none.
+inline PetscInt offset_of(PetscScalar wanted, const PetscScalar c[])
+{
+  const auto n = static_cast<PetscInt>(c[0]);
+  for (PetscInt i = 0; i < n; ++i)
+    if (c[1 + 2 * i] == wanted) return static_cast<PetscInt>(c[2 + 2 * i]);
+  return 0;
+}
+
 /// The parameter block of type @p P (a struct of PetscScalars that names its owner in `P::owner`).
 template <class P>
 P get(const PetscScalar c[])
@@ -70,36 +80,28 @@ P get(const PetscScalar c[])
   } else if constexpr (!std::is_empty_v<P>) {
     static_assert(std::is_trivially_copyable_v<P> && sizeof(P) % sizeof(PetscScalar) == 0,
                   "parameters reach the kernels as plain scalars");
-    constexpr PetscScalar wanted = tag(P::owner);
-    const auto n = static_cast<PetscInt>(c[0]);
-    for (PetscInt i = 0; i < n; ++i) {
-      if (c[1 + 2 * i] == wanted) {
-        std::memcpy(static_cast<void *>(&p), c + static_cast<PetscInt>(c[2 + 2 * i]), sizeof(P));
-        break;
-      }
-    }
+    const PetscInt offset = offset_of(tag(P::owner), c);
+    if (offset > 0) std::memcpy(static_cast<void *>(&p), c + offset, sizeof(P));
   }
   return p;
 }
 
-/// Where an effect's quantities begin in what is remembered at a point: a block of its own in the directory.
-constexpr PetscScalar memory_tag(const char *owner)
+/// Where an effect's quantities begin in what is remembered at a point of a cell, or of a facet: a block of its own in
+/// the directory.
+constexpr PetscScalar memory_tag(const char *owner, bool on_surface)
 {
-  return tag(owner) + 0.5; // tags are whole
+  return tag(owner) + (on_surface ? 0.25 : 0.5); // tags are whole
 }
 
-/// @p at a point's memory, moved on to the quantities of @p owner; nothing if it remembers none.
+/// @p at a point's memory, moved on to the quantities of @p owner; nothing if it remembers none there.
 template <class M>
-M memory(const M &at, const char *owner, const PetscScalar c[])
+M memory(const M &at, const char *owner, bool on_surface, const PetscScalar c[])
 {
-  const PetscScalar wanted = memory_tag(owner);
-  const auto n = static_cast<PetscInt>(c[0]);
-  for (PetscInt i = n - 1; at.last && i >= 0; --i) {
-    if (c[1 + 2 * i] != wanted) continue;
-    const auto offset = static_cast<PetscInt>(c[static_cast<PetscInt>(c[2 + 2 * i])]);
-    return {at.last + offset, at.earlier ? at.earlier + offset : nullptr};
-  }
-  return {};
+  const PetscScalar wanted = memory_tag(owner, on_surface);
+  const PetscInt block = at.last ? offset_of(wanted, c) : 0;
+  if (block == 0) return {};
+  const auto offset = static_cast<PetscInt>(c[block]);
+  return {at.last + offset, at.earlier ? at.earlier + offset : nullptr};
 }
 
 /// A function among the constants: its address, bit for bit.
@@ -157,10 +159,23 @@ struct Step {
   {}
 };
 
-/// What an effect remembers at a point of a cell (Composition::remember), as its own kernels see it.
+/// What an effect remembers at a point of a cell or a facet (Composition::remember), as its own kernels see it.
 struct Memory {
   const PetscScalar *last = nullptr; ///< at the last accepted state; null at the start, and where nothing is remembered
   const PetscScalar *earlier = nullptr; ///< at the one before that, where the time scheme looks back so far
+};
+
+/// The memory of a whole cell or facet. PETSc's own integrator hands no memory over: there the points find theirs by
+/// where they are.
+struct PlaceMemory {
+  static constexpr const char *owner = "place_memory"; ///< of its address among the constants
+  Memory first;                                        ///< of the first point
+  PetscInt width = 0;                                  ///< scalars of a point
+  std::vector<PetscReal> x;                            ///< [point][3], mm
+
+  Memory nearest(const PetscReal at[3]) const;
+  /// The memory of the point at @p at of the place that the constants @p c name, or none.
+  static Memory find(const PetscReal at[3], const PetscScalar c[]);
 };
 
 /// A quadrature point as a kernel sees it.
@@ -172,7 +187,7 @@ struct Point {
   PetscReal t;               ///< time, s
   PetscReal shift;           ///< d(u_t)/du in Jacobians, 1/s
   const PetscReal *x;        ///< material coordinates, mm
-  const PetscReal *normal;   ///< outward unit normal (surface kernels only)
+  const PetscReal *normal;   ///< outward unit normal (null in the volume)
   Step step;
   const PetscScalar *u_t = nullptr;      ///< velocity, mm/s
   PetscScalar p_t = 0;                   ///< kPa/s (airflow only)
@@ -218,7 +233,10 @@ Point make_point(PointState &storage, PetscInt Nf, PetscInt NfAux, const PetscIn
   if (!made) make_point_state(u_x + uOff_x[displacement], NfAux > 0 ? a_x + aOff_x[displacement] : nullptr, storage);
   Memory memory;
   if constexpr (!std::is_empty_v<P>)
-    if (made && a_t) memory = constants::memory(*reinterpret_cast<const Memory *>(a_t), owners_of<P>()[0], c);
+    memory = constants::memory(!made ? PlaceMemory::find(x, c)
+                               : a_t ? *reinterpret_cast<const Memory *>(a_t)
+                                     : memory,
+                               owners_of<P>()[0], normal != nullptr, c);
   return {made ? *reinterpret_cast<const PointState *>(a) : storage,
           u + uOff[displacement],
           gas ? u[uOff[pressure]] : 0,
@@ -311,7 +329,7 @@ template <class P>
 Point own_memory(Point point, const PetscScalar c[])
 {
   if constexpr (!std::is_empty_v<P>)
-    if (point.memory.last) point.memory = constants::memory(point.memory, owners_of<P>()[0], c);
+    point.memory = constants::memory(point.memory, owners_of<P>()[0], point.normal != nullptr, c);
   point.constants = c;
   return point;
 }
