@@ -472,22 +472,55 @@ PetscErrorCode Options::names(const std::string &name, const std::string &help, 
 }
 
 PetscErrorCode Options::reals(const std::string &name, const std::string &unit, Range range, const std::string &help,
-                              std::vector<PetscReal> &value)
+                              PetscReal value[], std::size_t most, std::size_t &n)
 {
+  const std::string option = full(name);
   std::string raw, text;
   bool is_given;
+  std::vector<std::pair<std::string, std::vector<PetscReal>>> lists{{}}; // that of all that is not named comes first
 
   PetscFunctionBeginUser;
-  for (const PetscReal v : value) text += (text.empty() ? "" : ",") + number_text(v);
+  for (std::size_t i = 0; i < n; ++i) text += (text.empty() ? "" : ",") + number_text(value[i]);
   PetscCall(find(name, text, unit, "each " + range.text(), help, raw, is_given));
   if (!is_given) PetscFunctionReturn(PETSC_SUCCESS);
-  value.clear();
   for (const std::string &part : split(raw, ',')) {
+    const std::size_t equals = part.rfind('=');
+    const bool names = equals != std::string::npos;
     double number;
-    PetscCall(parse_number(full(name), part, unit, range, number));
-    value.push_back(number);
+    if (names) {
+      const std::string part_name = part.substr(0, equals);
+      for (const auto &other : lists)
+        PulmoUserCheck(other.first != part_name, comm_,
+                       part_name.empty() ? "option %s: '%s' lacks a name" : "option %s names '%s' twice; leave one out",
+                       option.c_str(), part_name.empty() ? part.c_str() : part_name.c_str());
+      lists.emplace_back(part_name, std::vector<PetscReal>());
+    }
+    const std::string &list_name = lists.back().first;
+    PetscCall(parse_number(list_name.empty() ? option : option + " (" + list_name + ")",
+                           names ? part.substr(equals + 1) : part, unit, range, number));
+    lists.back().second.push_back(number);
   }
-  PulmoUserCheck(!value.empty(), comm_, "option %s needs a number", full(name).c_str());
+  const std::size_t count = lists.front().second.size();
+  PulmoUserCheck(count > 0, comm_, "option %s begins with the numbers (%s) of all that is not named, not with '%s'",
+                 option.c_str(), unit.c_str(), raw.c_str());
+  PulmoUserCheck(count <= most, comm_, "option %s takes up to %d numbers, not %d", option.c_str(),
+                 static_cast<int>(most), static_cast<int>(count));
+  for (const auto &[part_name, list] : lists)
+    PulmoUserCheck(list.size() == count, comm_, "option %s has %d numbers for '%s' and %d for all that is not named",
+                   option.c_str(), static_cast<int>(list.size()), part_name.c_str(), static_cast<int>(count));
+  n = count;
+  for (std::size_t i = 0; i < n; ++i) {
+    drop_varying(value[i]);
+    value[i] = lists.front().second[i];
+    Varying varying;
+    varying.option = option;
+    varying.unit = unit;
+    varying.text = raw;
+    varying.target = &value[i];
+    varying.everywhere = value[i];
+    for (std::size_t k = 1; k < lists.size(); ++k) varying.by_name.emplace_back(lists[k].first, lists[k].second[i]);
+    if (!varying.by_name.empty()) varying_.push_back(varying);
+  }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

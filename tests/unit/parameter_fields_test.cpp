@@ -6,6 +6,7 @@
 #include "pulmo/fem/held.hpp"
 #include "pulmo/observers/energy.hpp"
 #include "pulmo/observers/error_indicator.hpp"
+#include "pulmo/physics/effects/viscoelastic.hpp"
 #include "pulmo/physics/parameter_fields.hpp"
 
 #include <fstream>
@@ -77,6 +78,30 @@ void expect_same_run(const std::vector<SignalRow> &a, const std::vector<SignalRo
     EXPECT_NEAR(a[i].volume, b[i].volume, size == 1 ? 0 : 1e-9 * std::abs(a[1].volume)) << i;
     EXPECT_NEAR(a[i].flow, b[i].flow, size == 1 ? 0 : 1e-7 * std::abs(a[1].flow)) << i;
   }
+}
+
+TEST(ParameterFields, ListsHaveAValueOfEachPlace)
+{
+  using Block = ViscoelasticKernels::Parameters;
+  const Halves mesh;
+  const Registry registry = Registry::standard();
+  SceneRun run(registry);
+  PULMO_OK(prepare(run, mesh.options() + airflow +
+                            "-viscoelastic -viscoelastic_moduli 0.5,0.3,right=0.2,0.7 -viscoelastic_times 0.1,1"));
+  PULMO_OK(for_each_cell(run.model().dm(), [&](PetscInt c, const PetscReal x[3]) {
+    const Block block = constants::get<Block>(run.model().constants_at(c));
+    EXPECT_EQ(block.branches, 2);
+    EXPECT_EQ(block.g[0], x[0] > 1 ? 0.2 : 0.5);
+    EXPECT_EQ(block.g[1], x[0] > 1 ? 0.7 : 0.3);
+    EXPECT_EQ(block.tau[0], 0.1);
+    EXPECT_EQ(block.tau[1], 1);
+  }));
+  // what has the same numbers everywhere is the same run, named or not
+  std::vector<SignalRow> plain, named;
+  const std::string scene = mesh.options() + airflow + breath + "-ts_max_time 0.1 -viscoelastic ";
+  PULMO_OK(signals(scene + "-viscoelastic_moduli 0.5,0.3 -viscoelastic_times 0.1,1", plain));
+  PULMO_OK(signals(scene + "-viscoelastic_moduli 0.5,0.3,left=0.5,0.3 -viscoelastic_times 0.1,1,right=0.1,1", named));
+  expect_same_run(plain, named);
 }
 
 TEST(ParameterFields, EachCellAndFacetHasItsValue)

@@ -62,9 +62,10 @@ public:
                         std::string &value);
   /// Names separated by commas.
   PetscErrorCode names(const std::string &name, const std::string &help, std::vector<std::string> &value);
-  /// Any number of numbers, separated by commas.
+  /// Up to @p most numbers, separated by commas: @p n of them. Also `0.2,0.1,right=0.4,0.3`: as many for a named part
+  /// of the mesh.
   PetscErrorCode reals(const std::string &name, const std::string &unit, Range range, const std::string &help,
-                       std::vector<PetscReal> &value);
+                       PetscReal value[], std::size_t most, std::size_t &n);
   /// Three numbers separated by commas.
   PetscErrorCode vector(const std::string &name, const std::string &unit, const std::string &help, PetscReal value[3]);
 

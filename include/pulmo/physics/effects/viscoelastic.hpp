@@ -121,14 +121,15 @@ public:
     options.group(name(), about());
     PetscCall(options.flag("", "the tissue relaxes", on_));
     options.group(name(), about(), on_, "-viscoelastic");
-    PetscCall(options.reals("moduli", "-", Range::not_negative(), "stiffness of each branch over that of the law, g_i",
-                            moduli_));
-    PetscCall(options.reals("times", "s", Range::positive(), "time in which each branch relaxes, tau_i", times_));
-    PulmoUserCheck(moduli_.size() == times_.size(), options.comm(),
+    std::size_t n_times = branches_;
+    PetscCall(options.reals("moduli", "-", Range::not_negative(),
+                            "stiffness of each branch over that of the law, g_i (by region: 0.2,0.1,right=0.4,0.1)",
+                            parameters_.g, K::max_branches, branches_));
+    PetscCall(options.reals("times", "s", Range::positive(), "time in which each branch relaxes, tau_i",
+                            parameters_.tau, K::max_branches, n_times));
+    PulmoUserCheck(branches_ == n_times, options.comm(),
                    "-viscoelastic_moduli has %d numbers and -viscoelastic_times %d: give one of each for a branch",
-                   static_cast<int>(moduli_.size()), static_cast<int>(times_.size()));
-    PulmoUserCheck(moduli_.size() <= K::max_branches, options.comm(),
-                   "-viscoelastic_moduli has more than %d branches; leave some out", K::max_branches);
+                   static_cast<int>(branches_), static_cast<int>(n_times));
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
@@ -141,12 +142,10 @@ public:
 
     PetscFunctionBeginUser;
     const LawFunctions law = facts.law->functions();
-    parameters_.branches = static_cast<PetscScalar>(moduli_.size());
-    std::copy(moduli_.begin(), moduli_.end(), parameters_.g);
-    std::copy(times_.begin(), times_.end(), parameters_.tau);
+    parameters_.branches = static_cast<PetscScalar>(branches_);
     parameters_.stress = constants::to_scalar(law.stress);
     parameters_.tangent = constants::to_scalar(law.tangent);
-    for (std::size_t i = 0; i <= moduli_.size(); ++i)
+    for (std::size_t i = 0; i <= branches_; ++i)
       for (const char *component : components)
         quantities.push_back(
             {(i == 0 ? "elastic_stress_" : "overstress_" + std::to_string(i) + "_") + component, "kPa"});
@@ -160,8 +159,8 @@ public:
 
 private:
   bool on_ = false;
-  std::vector<PetscReal> moduli_{0.2, 0.2, 0.2}, times_{0.1, 1, 10};
-  mutable ViscoelasticKernels::Parameters parameters_{};
+  std::size_t branches_ = 3;
+  mutable ViscoelasticKernels::Parameters parameters_{0, {0.2, 0.2, 0.2}, {0.1, 1, 10}, 0, 0};
 };
 
 } // namespace pulmo
