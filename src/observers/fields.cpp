@@ -2,6 +2,7 @@
 #include "pulmo/base/hdf5_image.hpp"
 #include "pulmo/base/units.hpp"
 #include "pulmo/base/whole_file.hpp"
+#include "pulmo/fem/point_memory.hpp"
 #include "pulmo/mesh/node_order.hpp"
 #include "pulmo/observers/error_indicator.hpp"
 #include "pulmo/observers/output.hpp"
@@ -144,6 +145,17 @@ PetscErrorCode append_at(DM dm, PetscInt point, PetscInt field, const PetscScala
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+/// What a remembered quantity is called in the files: quantity, surface, unit.
+std::string remembered_name(const MemorySpec &spec, std::size_t index)
+{
+  const Quantity &quantity = spec.quantities[index];
+  std::string name = quantity.name + (spec.surface.empty() ? "" : "_" + spec.surface);
+  if (quantity.unit != "-") name += "_" + quantity.unit;
+  for (std::size_t slash; (slash = name.find('/')) != std::string::npos;) name.replace(slash, 1, "_per_");
+  std::replace(name.begin(), name.end(), ' ', '_');
+  return name;
+}
+
 /// The file of the snapshot @p index, or of what else belongs to it.
 std::string snapshot_name(PetscInt index, const char *what = "")
 {
@@ -159,6 +171,39 @@ FieldWriter::FieldWriter(const Output &output, const Scene &scene, Model &model)
 {}
 
 FieldWriter::~FieldWriter() = default;
+
+PetscErrorCode FieldWriter::setup()
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)model_.dm());
+  const std::vector<std::string> &wanted = output_.fields_memory();
+  std::vector<Remembered> offered;
+  std::string names;
+
+  PetscFunctionBeginUser;
+  if (wanted.empty()) PetscFunctionReturn(PETSC_SUCCESS);
+  for (const MemorySpec &spec : model_.composition().memories())
+    for (std::size_t i = 0; i < spec.quantities.size(); ++i) {
+      if (spec.quantities[i].unit.empty()) continue;
+      offered.push_back({&spec, i, remembered_name(spec, i)});
+      names += (names.empty() ? "" : ", ") + offered.back().name;
+    }
+  PulmoUserCheck(!offered.empty(), comm,
+                 "option -output_fields_memory: no effect of this scene remembers a quantity that has a unit; leave it "
+                 "out");
+  if (wanted.size() == 1 && wanted.front() == "all") {
+    remembered_ = offered;
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+  for (const std::string &name : wanted) {
+    const auto found =
+        std::find_if(offered.begin(), offered.end(), [&](const Remembered &r) { return r.name == name; });
+    PulmoUserCheck(found != offered.end(), comm,
+                   "option -output_fields_memory: no effect of this scene remembers '%s'; there is: all, or %s",
+                   name.c_str(), names.c_str());
+    remembered_.push_back(*found);
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
 
 PetscErrorCode FieldWriter::observe(const StepReport &step)
 {
@@ -203,8 +248,11 @@ PetscErrorCode FieldWriter::persist(Archive &archive, Vec local)
     PetscCall(archive.value("fields/breath", breath_));
     if (archive.reading()) PetscCall(VecCopy(local, phase_end_)); // unless a phase ends here it does not count
   }
-  for (const Snapshot &s : snapshots_)
-    names += s.file + " " + s.mesh + (s.error_indicator ? " " + error_indicator : "") + "\n";
+  for (const Snapshot &s : snapshots_) {
+    names += s.file + " " + s.mesh + (s.error_indicator ? " " + error_indicator : "");
+    for (const std::string &remembered : s.remembered) names += " " + remembered;
+    names += "\n";
+  }
   PetscCall(archive.text("fields/files", names));
   PetscCall(archive.table("fields/times_s", snapshots_, Snapshot(), [](Snapshot &s, Cells &cells) { cells(s.time); }));
   PetscCall(archive.value("fields/count", count_));
@@ -214,8 +262,14 @@ PetscErrorCode FieldWriter::persist(Archive &archive, Vec local)
       std::string line, more;
       std::getline(lines, line);
       std::istringstream words(line);
-      words >> s.file >> s.mesh >> more;
-      s.error_indicator = more == error_indicator;
+      words >> s.file >> s.mesh;
+      s.error_indicator = false;
+      while (words >> more) {
+        if (more == error_indicator)
+          s.error_indicator = true;
+        else
+          s.remembered.push_back(more);
+      }
       const bool plain = s.file.rfind("fields", 0) == 0 && s.mesh.rfind("fields", 0) == 0 &&
                          (s.file + s.mesh).find('/') == std::string::npos;
       PetscCall(archive.check(plain, "fields/files"));
@@ -446,9 +500,16 @@ PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
     if (gas) PetscCall(file.write(flow_error_name, 1, errors.flow));
     PetscCall(file.write(whole_error_name, 1, whole));
   }
+  std::vector<std::string> remembered;
+  for (const Remembered &r : remembered_) {
+    std::vector<PetscScalar> means;
+    model_.memory()->means(*r.spec, r.index, means);
+    PetscCall(file.write(r.name, 1, means));
+    remembered.push_back(r.name);
+  }
   PetscCall(file.close(output_.path(name)));
   ++count_;
-  snapshots_.push_back({time, name, mesh_, output_.error_indicator()});
+  snapshots_.push_back({time, name, mesh_, output_.error_indicator(), remembered});
   PetscCall(write_index());
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -497,6 +558,7 @@ PetscErrorCode FieldWriter::write_index() const
       }
       if (s.error_indicator) of_cells(tissue_error_name);
       if (s.error_indicator && scene_.facts().airflow) of_cells(flow_error_name);
+      for (const std::string &name : s.remembered) of_cells(name.c_str());
       f << " </Grid>\n";
     }
     f << "</Grid>\n</Domain>\n</Xdmf>\n";

@@ -66,6 +66,7 @@ PetscErrorCode Output::declare(Options &options)
                          fields_every_));
   PetscCall(options.flag("fields_error_indicator", "write what each cell adds to the error in space (docs/accuracy)",
                          error_indicator_));
+  PetscCall(options.names("fields_memory", "write what effects remember: names of quantities, or all", fields_memory_));
   options.group("progress", "progress");
   PetscCall(options.flag("", "one line a step", progress_));
   PetscFunctionReturn(PETSC_SUCCESS);

@@ -508,6 +508,7 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   GravityAudit gravity(scene, run.model(), sampling);
   const bool heavy = scene.facts().gravity.has_value();
   Audits audits{regions, audit_energy ? &energy : nullptr, heavy ? &gravity : nullptr};
+  PetscCall(fields.setup());
   PetscCall(sampling.setup(run.model()));
   PetscCall(regions.setup());
   simulation.add(regions);

@@ -451,6 +451,35 @@ class OtherScenes(unittest.TestCase):
         self.assertEqual(case.json()["options"]["-output_dir"], case.directory)
 
 
+class Remembered(unittest.TestCase):
+    """-output_fields_memory; what facets remember: tests/unit/point_memory_test.cpp."""
+
+    # the gas inflates the cube evenly
+    EVEN = pulmo.TIGHT + pulmo.PCV + pulmo.CUBE + pulmo.STILL + [
+        "-chest_wall", "off", "-support", "-support_rigid", "-lumen_pressure", "off", "-tissue", "yoshihara", "-viscoelastic",
+        "-ts_max_time", "0.2", "-output_fields_every", "0.1"]
+    NAMES = ["elastic_stress_xx_kPa", "elastic_stress_yz_kPa", "overstress_2_zz_kPa"]
+
+    def test_stress_of_an_even_inflation(self):
+        for ranks in (1, 2):
+            _, _, steps = read_fields(pulmo.finished(self.EVEN + ["-output_fields_memory", ",".join(self.NAMES)], ranks=ranks))
+            for time, _, cellwise in steps:
+                self.assertEqual(set(self.NAMES), {name for name in cellwise if "stress_" in name} - OF_CELLS)
+                # F = a I: S = (a / J) a sigma, J = a^3
+                elastic, shear, viscous = (cellwise[name] for name in self.NAMES)
+                expected = cellwise["hydrostatic_stress_kPa"] * np.cbrt(cellwise["J_mean"])
+                np.testing.assert_allclose(elastic, expected, rtol=1e-7, atol=1e-12)
+                np.testing.assert_allclose(shear, 0, atol=1e-9)
+                self.assertEqual(viscous.min() > 0, time > 0)
+            self.assertGreater(steps[-1][2]["elastic_stress_xx_kPa"].min(), 0.01)
+
+    def test_all(self):
+        _, _, steps = read_fields(pulmo.finished(self.EVEN + ["-output_fields_memory", "all", "-viscoelastic_moduli", "0.1",
+                                                              "-viscoelastic_times", "2"]))
+        names = {f"{what}_{c}_kPa" for what in ("elastic_stress", "overstress_1") for c in ("xx", "yy", "zz", "yz", "xz", "xy")}
+        self.assertEqual({name for name in steps[-1][2] if "stress_" in name} - OF_CELLS, names)
+
+
 class ErrorIndicator(unittest.TestCase):
     """-output_fields_error_indicator; against true errors: tests/unit/error_indicator_test.cpp, tests/verification/mms."""
 
@@ -519,7 +548,7 @@ class Help(unittest.TestCase):
         "-ventilator_breaths": "-", "-lumen_pressure": "on/off", "-lumen_pressure_surfaces": None, "-support": "on/off",
         "-support_rigid": "on/off", "-support_surfaces": None, "-traction": "on/off", "-traction_surfaces": None,
         "-traction_value": "kPa", "-quadrature_degree": "-", "-output_dir": "text", "-output_overwrite": "on/off",
-        "-output_fields_every": "s", "-output_fields_error_indicator": "on/off", "-progress": "on/off", "-effects_view": "on/off", "-energy_audit": "on/off",
+        "-output_fields_every": "s", "-output_fields_memory": None, "-output_fields_error_indicator": "on/off", "-progress": "on/off", "-effects_view": "on/off", "-energy_audit": "on/off",
         "-gravity": "on/off", "-gravity_direction": "-", "-gravity_acceleration": "m/s^2", "-gravity_tissue_density": "kg/m^3",
         "-gravity_air_density": "kg/m^3"}
 

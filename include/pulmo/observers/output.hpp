@@ -35,6 +35,8 @@ public:
   const std::string &directory() const { return directory_; }
   bool progress() const { return progress_; }
   PetscReal fields_every() const { return fields_every_; } ///< s; 0: at phase ends
+  /// Remembered quantities that snapshots hold, or `all`.
+  const std::vector<std::string> &fields_memory() const { return fields_memory_; }
   /// Whether snapshots hold the indicators of pulmo/observers/error_indicator.hpp.
   bool error_indicator() const { return error_indicator_; }
 
@@ -45,6 +47,7 @@ private:
   std::string directory_ = "results";
   bool overwrite_ = false, progress_ = true, error_indicator_ = false;
   PetscReal fields_every_ = 0;
+  std::vector<std::string> fields_memory_;
   RunLock lock_; ///< of rank 0
 };
 
@@ -102,6 +105,8 @@ class FieldWriter final : public Observer {
 public:
   FieldWriter(const Output &output, const Scene &scene, Model &model);
   ~FieldWriter() override;
+  /// Finds what `-output_fields_memory` names; user errors. Collective.
+  PetscErrorCode setup();
   PetscErrorCode observe(const StepReport &step) override;
   /// The snapshots so far.
   PetscErrorCode persist(Archive &archive, Vec local) override;
@@ -125,6 +130,13 @@ private:
     PetscReal time;         ///< s
     std::string file, mesh; ///< in the output directory
     bool error_indicator;   ///< whether it has one
+    std::vector<std::string> remembered;
+  };
+  /// A quantity that effects remember, and what it is called in the files.
+  struct Remembered {
+    const MemorySpec *spec;
+    std::size_t index;
+    std::string name;
   };
 
   const Output &output_;
@@ -138,6 +150,7 @@ private:
   std::string mesh_ = "fields.h5"; ///< nodes and cells of this session's snapshots
   bool mesh_written_ = false;
   Schedule schedule_;
+  std::vector<Remembered> remembered_;
   VecHandle breath_start_, phase_end_;        ///< local states, with a ventilator: at the start of the breath at hand,
                                               ///< and at the end of the last phase
   int breath_ = 0;                            ///< the breath at hand
