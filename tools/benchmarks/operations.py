@@ -19,10 +19,10 @@ VECTOR = {"ymm": 2, "zmm": 4}  # times the lanes of xmm
 PLAIN = re.compile(r"^v?(h?add|h?sub|addsub|mul|div|sqrt|max|min)(sd|pd)$")
 FUSED = re.compile(r"^vfn?m(add|sub|addsub|subadd)\d{3}(sd|pd)$")
 # where the time goes: the first pattern that is found in the name of a function decides; others are no part of it
-GROUPS = {"insertion into the matrix": r"add_to_matrix|MatZeroEntries|MatZeroRows",
+GROUPS = {"insertion into the matrix": r"MatrixMap::add|MatZeroEntries|MatZeroRows",
           "element matrices and vectors": r"MatrixBuilder|product_(tile|rows)|add_to_vector",
-          "gradients and states": r"PointData|make_point|invariants|Places",
-          "laws and fluxes": r"Kernels|volume_(residual|jacobian)|surface_(residual|jacobian)|cofactor|expm1|log1p|_(exp|log|pow)_",
+          "gradients and states": r"PointData|interpolate|make_point|invariants|Places",
+          "laws and fluxes": r"Kernels|energy_derivatives|volume_(residual|jacobian)|surface_(residual|jacobian)|cofactor|expm1|log1p|_(exp|log|pow)_",
           "gather, scatter, clearing": r"Assembly::(residual|jacobian|for_blocks)|integrate_(vectors|matrices)|memset"}
 
 
