@@ -36,6 +36,16 @@ public:
   {
     return make<PermeabilityLaw>(permeability_laws_);
   }
+  /// The same but for the effects of which @p leave_out says so.
+  Registry without(const std::function<bool(const Effect &)> &leave_out) const
+  {
+    Registry rest = *this;
+    rest.effects_.clear();
+    for (const auto &maker : effects_)
+      if (!leave_out(*maker())) rest.effects_.push_back(maker);
+    return rest;
+  }
+
   /// Effects beside tissue, airflow and ventilator (which the scene knows by name).
   std::vector<std::unique_ptr<Effect>> make_effects() const { return make<Effect>(effects_); }
 

@@ -14,7 +14,10 @@ class Support final : public Effect {
 public:
   const char *name() const override { return "support"; }
   const char *about() const override { return "prescribed displacement on surfaces, pins against rigid motions"; }
-  std::string example() const override { return "-support -support_rigid"; }
+  std::string example() const override
+  {
+    return "-support -support_surfaces airway -support_components_airway x -support_displacement_airway 0.1,0,0";
+  }
   bool active() const override { return on_; }
 
   PetscErrorCode declare(Options &options) override
