@@ -157,7 +157,7 @@ PetscErrorCode check_jacobian(const Subject &subject, Findings &findings)
   PetscCall(PetscRandomSetInterval(numbers, -1, 1));
   PetscCall(VecSetRandom(d, numbers));
   PetscCall(PetscRandomDestroy(&numbers));
-  if (subject.airway == Airway::held) PetscCall(run.model().set_airway_nodes(d, 0)); // Newton never moves these
+  if (subject.airway == Airway::held) PetscCall(run.model().airway().set(d, 0)); // Newton never moves these
   for (const Stage &stage : stages(s.dt)) PetscCall(compare_jacobian(run, s, stage, d, findings));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
