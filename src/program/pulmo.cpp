@@ -2,13 +2,12 @@
 #include "pulmo/pulmo.hpp"
 
 #include "pulmo/base/units.hpp"
-#include "pulmo/fem/free_boundary.hpp"
 #include "pulmo/fem/held.hpp"
 #include "pulmo/input/errors.hpp"
 #include "pulmo/observers/checkpoint.hpp"
-#include "pulmo/physics/effects/pressure_damping.hpp"
 #include "pulmo/physics/parameter_fields.hpp"
 #include "pulmo/program/error_estimate.hpp"
+#include "pulmo/program/notes.hpp"
 
 #include <algorithm>
 #include <csignal>
@@ -98,230 +97,6 @@ PetscErrorCode keep_last_state(Checkpoint &checkpoint, const Simulation &simulat
   PetscCall(checkpoint.write(complaint));
   text = complaint.empty() ? " With another solver go on from there: -restart " + checkpoint.path() + "."
                            : " No checkpoint: " + complaint + ".";
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-/// Says so before the run if it will have no numbers of a breath.
-PetscErrorCode note_no_breath(MPI_Comm comm, const Scene &scene)
-{
-  PetscFunctionBeginUser;
-  if (!scene.facts().ventilator || scene.facts().ventilator->breathes()) PetscFunctionReturn(PETSC_SUCCESS);
-  PetscCall(PetscPrintf(comm,
-                        "pulmo: note: %s. The numbers of breaths will be null; the static curve has the end of each "
-                        "pause (a phase named 'pause', or of 'hold')\n",
-                        why_no_numbers(scene, {}).c_str()));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-/// Says when the run first left the range of the model: below J = 1 - Phi0 the porosity is negative, and no tissue law
-/// but berger keeps J from it.
-PetscErrorCode warn_of_no_air(MPI_Comm comm, const Options &options, const Scene &scene, const Simulation &simulation,
-                              const RegionAudit &regions)
-{
-  PetscFunctionBeginUser;
-  if (!scene.facts().airflow) PetscFunctionReturn(PETSC_SUCCESS);
-  const std::vector<double> porosity = regions.least_porosity(simulation.rows());
-  const auto first = std::find_if(porosity.begin(), porosity.end(), [](double least) { return least < 0; });
-  if (first == porosity.end()) PetscFunctionReturn(PETSC_SUCCESS);
-  std::string given;
-  for (const auto &[name, value] : options.own_used())
-    if (name == "-tissue_porosity") given = value;
-  PetscCall(
-      PetscPrintf(comm,
-                  "pulmo: warning: at t = %g s the porosity falls below zero: J is less than 1 - Phi0 (least J %g, "
-                  "-tissue_porosity %s), so that there would be less than no air; from there on the numbers mean "
-                  "nothing. What to try: less suction, -tissue berger, a larger -tissue_porosity\n",
-                  (double)simulation.rows()[first - porosity.begin()].time,
-                  (double)simulation.rows()[first - porosity.begin()].min_J, given.c_str()));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-/// Says where the volume of a ventilated lung is no animal's: a shrew's has 0.05 ml, an elephant's a hundred litres.
-PetscErrorCode warn_of_size(MPI_Comm comm, const Scene &scene)
-{
-  constexpr PetscReal least = 0.02, largest = 2e5; // ml
-  const PetscReal volume = scene.mesh().volume() / units::mm3_per_ml;
-
-  PetscFunctionBeginUser;
-  if (scene.facts().ventilator && (volume < least || volume > largest))
-    PetscCall(
-        PetscPrintf(comm,
-                    "pulmo: warning: the lung has %.3g ml, %s than any animal's: coordinates times -mesh_scale "
-                    "have to be mm; give the -mesh_scale that makes them so (an adult's lung has 2000 to 6000 ml, a "
-                    "mouse's 0.2 ml)\n",
-                    (double)volume, volume < least ? "less" : "more"));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-/// A lung at rest has 0.2 to 0.3 g/ml, where the default porosity (the paper's, for which weight is nothing) gives
-/// 0.012.
-PetscErrorCode note_weightless(MPI_Comm comm, const Scene &scene, const GravityAudit &gravity)
-{
-  constexpr double light = 0.1, real = 0.26, tissue = 1.05; // g/ml
-  const double volume = scene.mesh().volume() / units::mm3_per_ml;
-
-  PetscFunctionBeginUser;
-  if (gravity.weight() < light * volume)
-    PetscCall(PetscPrintf(comm,
-                          "pulmo: note: with -tissue_porosity %g a lung of %.4g ml weighs %.3g g, so that gravity does "
-                          "almost nothing; a real one of that size weighs about %.3g g: give -tissue_porosity %.2f\n",
-                          (double)scene.tissue().porosity().reference, volume, gravity.weight(), real * volume,
-                          1 - real / tissue));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-/// Elements of equal order are not stable where the tissue is undrained: in steps @p dt (s) in which pressure spreads
-/// by less than half a cell, k M dt < (h/2)^2. Says so, once.
-PetscErrorCode warn_of_equal_order(MPI_Comm comm, const Scene &scene, const Model &model, PetscReal dt, bool &warned)
-{
-  const SceneFacts &facts = scene.facts();
-  const Elements &elements = facts.elements;
-  const PetscReal half_edge = scene.mesh().edge() / 2;
-
-  PetscFunctionBeginUser;
-  if (warned || !facts.airflow || facts.pressure_damping || elements.displacement > elements.pressure)
-    PetscFunctionReturn(PETSC_SUCCESS);
-  warned = scene.airflow().permeability_at_rest() * model.modulus() * dt < half_edge * half_edge;
-  if (warned)
-    PetscCall(
-        PetscPrintf(comm,
-                    "pulmo: warning: in a step of %g s pressure spreads by less than half a cell, where "
-                    "-elements %s is not stable: look for a pressure that oscillates, or give -pressure_damping\n",
-                    (double)dt, elements.name()));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-/// Pressures and times of a programme that no lung sees, or that its steps do not resolve: told, as each may be meant.
-PetscErrorCode note_programme(MPI_Comm comm, const Scene &scene, PetscReal asked_dt)
-{
-  constexpr PetscReal least = 1, largest = 60, // cmH2O
-      shortest = 1e-3,                         // s
-      same_time = 1e-6;
-  PetscReal low = PETSC_MAX_REAL, high = PETSC_MIN_REAL, extreme = 0; // of breaths; of all
-  bool told_short = false, told_step = false, flows = false;
-
-  PetscFunctionBeginUser;
-  if (!scene.facts().ventilator) PetscFunctionReturn(PETSC_SUCCESS);
-  for (const Phase &phase : scene.facts().ventilator->phases()) {
-    const PetscReal duration = phase.end - phase.begin, dt = phase.dt.value_or(asked_dt),
-                    part = phase.ramp > 0 ? std::min(phase.ramp, duration) : duration;
-    if (phase.control == Control::pressure) {
-      for (const PetscReal kPa : {phase.from.value_or(phase.to), phase.to}) {
-        const PetscReal P = kPa / units::kPa_per_cmH2O;
-        if (phase.breath > 0) {
-          low = std::min(low, P);
-          high = std::max(high, P);
-        }
-        if (std::abs(P) > std::abs(extreme)) extreme = P;
-      }
-    } else {
-      flows = flows || phase.to != 0;
-    }
-    if (!told_short && duration < shortest) {
-      told_short = true;
-      PetscCall(PetscPrintf(comm,
-                            "pulmo: warning: phase '%s' lasts %g s: durations are in seconds, and no breath has a "
-                            "phase as short; what comes of it is the numbers' answer to a jump, not a lung's\n",
-                            phase.name.c_str(), (double)duration));
-    } else if (!told_step && dt > part * (1 + same_time)) {
-      told_step = true;
-      PetscCall(PetscPrintf(comm,
-                            "pulmo: note: a step of %g s is longer than %s of phase '%s' (%g s), which a single step "
-                            "takes then: volumes and fits hang on the step; give a smaller -ts_dt, or see how they "
-                            "change with it (-error_estimate)\n",
-                            (double)dt, phase.ramp > 0 ? "the ramp" : "the whole", phase.name.c_str(), (double)part));
-    }
-  }
-  if (std::abs(extreme) > largest)
-    PetscCall(PetscPrintf(comm,
-                          "pulmo: warning: the ventilator gives %.4g cmH2O: a lung sees about %g to %g cmH2O, and "
-                          "pressures are in cmH2O (1 cmH2O = 98.07 Pa = 0.09807 kPa); give -ventilator_pip, or the "
-                          "programme's pressures, in that unit\n",
-                          (double)extreme, (double)least, (double)largest));
-  else if (!flows && extreme != 0 && std::abs(extreme) < least)
-    PetscCall(PetscPrintf(comm,
-                          "pulmo: warning: the ventilator gives no more than %.4g cmH2O: a lung sees about %g to %g "
-                          "cmH2O, and pressures are in cmH2O (0.1 kPa = 1.02 cmH2O); give -ventilator_pip, or the "
-                          "programme's pressures, in that unit\n",
-                          (double)extreme, (double)least, (double)largest));
-  if (!flows && high == low)
-    PetscCall(PetscPrintf(comm,
-                          "pulmo: note: the ventilator's pressure is %.4g cmH2O throughout (-ventilator_pip "
-                          "equals -ventilator_peep): no breath\n",
-                          (double)high));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-/// Says where springs act on a surface that a support holds: they are never strained.
-PetscErrorCode note_idle_springs(MPI_Comm comm, const Composition &composition)
-{
-  const std::vector<std::string> springs = composition.surfaces_of("chest_wall");
-
-  PetscFunctionBeginUser;
-  for (const Constraint &c : composition.constraints()) {
-    const bool whole = c.effect == "support" && c.component[0] && c.component[1] && c.component[2];
-    if (whole && !c.surface.empty() && std::find(springs.begin(), springs.end(), c.surface) != springs.end())
-      PetscCall(PetscPrintf(comm,
-                            "pulmo: note: the springs of -chest_wall on surface '%s' do nothing: -support_surfaces "
-                            "holds it; leave the surface out of one of the two (-chest_wall_surfaces)\n",
-                            c.surface.c_str()));
-  }
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-/// Damping is in proportion to h^2 / M with the edge h of a cell and the stiffness M of the tissue; where options make
-/// it far larger it is no longer a perturbation of the mesh's own size.
-PetscErrorCode check_damping(MPI_Comm comm, const Scene &scene, const Model &model)
-{
-  constexpr PetscReal told = 10, refused = 1000;
-
-  PetscFunctionBeginUser;
-  if (!scene.facts().pressure_damping) PetscFunctionReturn(PETSC_SUCCESS);
-  const PetscReal h = scene.mesh().edge(), c = scene.facts().elements.displacement == 1 ? 4 : 6,
-                  beta = constants::get<PressureDampingKernels::Parameters>(model.constants_at(0)).beta,
-                  share = beta / (h * h / (c * model.modulus()));
-  char fix[256];
-  PetscCall(PetscSNPrintf(fix, sizeof(fix),
-                          "the pressure is damped %.3g times as much as this mesh asks for (cells of %.3g mm, tissue "
-                          "of %.3g kPa); leave -pressure_damping_length and -pressure_damping_modulus out, or give "
-                          "these values",
-                          (double)share, (double)h, (double)model.modulus()));
-  PulmoUserCheck(share <= refused, comm, "-pressure_damping: %s", fix);
-  if (share > told) PetscCall(PetscPrintf(comm, "pulmo: warning: -pressure_damping: %s: resistance is too low\n", fix));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-/// Where gas crosses a cell in this share of a step the flow is lost in rounding: no tolerance solves the step.
-PetscErrorCode check_permeability(MPI_Comm comm, const Scene &scene, const Model &model, PetscReal dt)
-{
-  constexpr PetscReal most = 1e12;
-  const PetscReal L = scene.mesh().length();
-
-  PetscFunctionBeginUser;
-  if (!scene.facts().airflow) PetscFunctionReturn(PETSC_SUCCESS);
-  const PetscReal k = scene.airflow().permeability_at_rest(), bound = most * L * L / (model.modulus() * dt);
-  PulmoUserCheck(k <= bound, comm,
-                 "-airflow_permeability %g mm^2/(kPa s) is so large that the flow is lost in rounding; give less than "
-                 "%.1g: far below that there is no resistance left to speak of (or -airflow off)",
-                 (double)k, (double)bound);
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-/// A passive lung takes gas in where the pressure rises.
-PetscErrorCode warn_of_shrinking(MPI_Comm comm, const Simulation &simulation, const RegionAudit &regions)
-{
-  const std::vector<SignalRow> rows = regions.complete(simulation.rows());
-  const auto found = shrinks_under_pressure(rows);
-
-  PetscFunctionBeginUser;
-  if (found)
-    PetscCall(PetscPrintf(comm,
-                          "pulmo: warning: at t = %g s the lung has %.4g ml less than at the start of the breath, "
-                          "though the pressure has risen by %.4g cmH2O: unless a load or a support pushes it, tissue "
-                          "or springs are not stable there, and the numbers are no lung's; look at -tissue and its "
-                          "parameters\n",
-                          rows[*found].time, rows[breath_rows(rows).front().first].volume - rows[*found].volume,
-                          rows[*found].machine_pressure() - rows[breath_rows(rows).front().first].machine_pressure()));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -479,14 +254,7 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
     PetscFunctionReturn(PETSC_SUCCESS);
   }
   PetscCall(check_held(comm, scene, run.model().composition()));
-  PetscCall(note_free_boundary(run.model().composition(), scene.facts().airflow));
-  PetscCall(warn_of_size(comm, scene));
-  PetscCall(note_idle_springs(comm, run.model().composition()));
-  PetscCall(check_damping(comm, scene, run.model()));
-  PetscCall(check_permeability(comm, scene, run.model(), simulation.wanted_dt()));
-  PetscCall(note_programme(comm, scene, simulation.wanted_dt()));
-  if (!run.settle_note().empty()) PetscCall(PetscPrintf(comm, "pulmo: note: %s\n", run.settle_note().c_str()));
-  PetscCall(note_no_breath(comm, scene));
+  PetscCall(look_ahead(comm, scene, run.model(), simulation, run.settle_note()));
   PetscCall(error_estimate.check(options, scene));
   const Elements &elements = scene.facts().elements;
   PulmoUserCheck(!output.error_indicator() || (elements.displacement == 2 && elements.pressure == 1), comm,
@@ -543,12 +311,8 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   }
   if (finished && audit_energy) PetscCall(hold_energy(comm, energy, run.model(), simulation, finished));
   PetscCall(options.warn_unused(scene.facts().airflow, true));
-  PetscCall(warn_of_no_air(comm, options, scene, simulation, regions));
-  if (!scene.facts().settling.off || run.settle_note().empty()) // else loads that act at rest are told already
-    PetscCall(warn_of_shrinking(comm, simulation, regions));
-  PetscCall(simulation.pins().warn(run.model()));
-  for (const SignalRow &row : simulation.rows()) // steps that were cut
-    if (row.dt > 0) PetscCall(warn_of_equal_order(comm, scene, run.model(), row.dt, warned_of_elements));
+  PetscCall(look_back(comm, options, scene, run.model(), simulation, regions, !run.settle_note().empty(),
+                      warned_of_elements));
   if (view_effects) PetscCall(print_ledger(comm, scene, run.model(), simulation.seconds()));
   if (audit_energy) PetscCall(write_energy(comm, output, simulation, energy));
   if (!finished) {

@@ -103,6 +103,8 @@ private:
   /// Ends the run with @p reason if a signal asks to stop.
   PetscErrorCode heed_signal(TSConvergedReason reason);
   PetscErrorCode offer_fixed_stress(KSP ksp);
+  /// Two times closer than this share of the step are the same.
+  static constexpr PetscReal same_time = 1e-9;
   /// Whether two times of this run are the same up to rounding.
   bool same(PetscReal t, PetscReal other) const;
   /// The last accepted state is at a kink in time: nothing may look back beyond it.
