@@ -109,7 +109,7 @@ PetscErrorCode closed_residual(SceneRun &run, State &s, Vec d, PetscReal h, Pets
   PetscCall(residual_at(run, s, d, h, shift, F));
   PetscCall(VecDuplicate(F, X.out()));
   PetscCall(DMLocalToGlobal(run.model().dm(), s.work, INSERT_VALUES, X));
-  PetscCall(run.model().close_rows(X, F));
+  PetscCall(run.model().airway().close_rows(X, F));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
