@@ -153,10 +153,10 @@ class Arithmetic(unittest.TestCase):
             "CM3": lambda s, J: 0.3567 * (3 * s - 3) + 0.3567 / 1.075 * (J ** -2.15 - 1) + 5.766e-3 * (s - 1) ** 6,
             "CM4": lambda s, J: 1.298 * (3 * s - 3) + 1.298 / 0.75 * (J ** -1.5 - 1),
             "CM5": lambda s, J: 16.5 / 4 * (J * J - 1 - 2 * math.log(J))}
-        for label, W in energies.items():
-            J, h = laws.FREE_INFLATION[label], 1e-5
+        for law in laws.LAWS:
+            W, J, h = energies[law.label], law.inflation, 1e-5
             slope = (W((J + h) ** (2 / 3), J + h) - W((J - h) ** (2 / 3), J - h)) / (2 * h)
-            self.assertAlmostEqual(slope / pulmo.KPA_PER_CMH2O, 6, delta=0.003, msg=label)
+            self.assertAlmostEqual(slope / pulmo.KPA_PER_CMH2O, 6, delta=0.003, msg=law.label)
 
 
 if __name__ == "__main__":

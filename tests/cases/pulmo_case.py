@@ -21,6 +21,7 @@ SOURCE = os.environ.get("PULMO_SOURCE_DIR", os.path.dirname(os.path.dirname(os.p
 sys.path.insert(0, os.path.join(SOURCE, "tools"))
 from shared import common  # noqa: E402
 from shared.common import KPA_PER_CMH2O  # noqa: E402, F401: of the tests
+from shared.signals import columns  # noqa: E402
 
 PROGRAM, LAUNCHER = None, ["mpiexec", "--oversubscribe", "-n"]
 _scratch = tempfile.TemporaryDirectory(prefix="pulmo_case_")
@@ -136,9 +137,7 @@ class Case:
 
     def signals(self, name="signals.csv"):
         """Column -> array; the phase as a list of names."""
-        with open(self.path(name), newline="") as f:
-            rows = list(csv.DictReader(f))
-        return {c: [r[c] for r in rows] if c == "phase" else np.array([float(r[c]) for r in rows]) for c in rows[0]}
+        return {c: list(map(str, v)) if c == "phase" else v for c, v in columns(self.path(name)).items()}
 
     def json(self, name="summary.json"):
         with open(self.path(name)) as f:

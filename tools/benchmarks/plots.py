@@ -1,7 +1,8 @@
 """Pictures of benchmarks: runs side by side (seconds by stage, memory, Krylov iterations), iterations over permeability."""
-import csv
 import importlib
 import textwrap
+
+from shared.signals import whole_rows
 
 
 class Pyplot:
@@ -38,8 +39,7 @@ def krylov_of_steps(result):
     path = result["folder"] / "run/signals.csv"
     if not path.exists():
         return [], []
-    with open(path, newline="") as f:
-        rows = [r for r in csv.DictReader(f) if float(r.get("krylov_iterations") or 0) > 0]
+    rows = [r for r in whole_rows(path) if float(r.get("krylov_iterations") or 0) > 0]
     return ([float(r["time_s"]) for r in rows],
             [float(r["krylov_iterations"]) / float(r["newton_iterations"]) for r in rows])
 

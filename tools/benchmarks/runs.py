@@ -3,7 +3,6 @@
 A run is known by its words and by all that it reads (keys.py): a new build, an edited mesh, programme or .petscrc is a new run. A run that failed is finished too; one that was interrupted is not, nor one that was
 ended after less time than it is given now.
 """
-import csv
 import json
 import os
 import re
@@ -17,6 +16,7 @@ from pathlib import Path
 
 from shared.common import environment
 from shared.keys import digest
+from shared.signals import whole_rows
 
 STAGES = ["setup", "residual", "jacobian", "solve", "output"]
 POLL = 0.05  # s between looks at a running program
@@ -146,8 +146,7 @@ def signals(result):
     for name in ("signals.csv", "signals.csv.part"):
         path = result["folder"] / "run" / name
         if path.exists():
-            with open(path, newline="") as f:
-                return [row for row in csv.DictReader(f) if row.get("volume_ml")]
+            return whole_rows(path)
     return []
 
 

@@ -9,16 +9,15 @@ dataset of one dimension, tetrahedra in the order of the mesh file (meshio's ord
 Runs on Debian's python3-numpy, -meshio and -h5py.
 """
 import argparse
-import os
 import sys
 
 import h5py
 import meshio
 import numpy as np
 
+from shared.common import written_whole
 
-class CellValuesError(Exception):
-    """A request that cannot be met, in one sentence."""
+from .mesh import MeshError
 
 
 def places(path):
@@ -26,9 +25,9 @@ def places(path):
     try:
         mesh = meshio.read(path)
     except (OSError, ValueError, KeyError, IndexError, meshio.ReadError, SystemExit) as error:
-        raise CellValuesError(f"{path} is not a mesh that meshio reads ({error})") from error
+        raise MeshError(f"{path} is not a mesh that meshio reads ({error})") from error
     if "tetra" not in mesh.cells_dict:
-        raise CellValuesError(f"{path} holds no tetrahedra")
+        raise MeshError(f"{path} holds no tetrahedra")
     corners = mesh.points[mesh.cells_dict["tetra"]]
     x, y, z = corners.mean(axis=1).T
     volume = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1]))
@@ -47,10 +46,10 @@ def evaluate(expression, names):
     try:
         values = np.asarray(eval(expression, {"__builtins__": {}} | vars(np) | names), dtype=float)  # the user's own words
     except Exception as error:  # whatever an expression may raise
-        raise CellValuesError(f"'{expression}' cannot be worked out ({error})") from error
+        raise MeshError(f"'{expression}' cannot be worked out ({error})") from error
     values = np.broadcast_to(values, names["x"].shape)
     if not np.isfinite(values).all():
-        raise CellValuesError(f"'{expression}' is no finite number in {np.sum(~np.isfinite(values))} cells")
+        raise MeshError(f"'{expression}' is no finite number in {np.sum(~np.isfinite(values))} cells")
     return values
 
 
@@ -66,14 +65,12 @@ def main():
         for word in args.values:
             name, equals, expression = word.partition("=")
             if not (name and equals and expression):
-                raise CellValuesError(f"'{word}' is no NAME=EXPRESSION")
+                raise MeshError(f"'{word}' is no NAME=EXPRESSION")
             made[name] = evaluate(expression, names)
-        part = f"{args.file}.part"
-        with h5py.File(part, "w", track_order=True) as file:
+        with written_whole(args.file) as part, h5py.File(part, "w", track_order=True) as file:
             for name, values in made.items():
                 file.create_dataset(name, data=values, compression="gzip", shuffle=True, track_times=False)
-        os.replace(part, args.file)  # under its own name it is whole
-    except (CellValuesError, OSError) as error:
+    except (MeshError, OSError) as error:
         sys.exit(f"cell_values: error: {error}")
     for name, values in made.items():
         print(f"{name}: {len(values)} cells, {values.min():g} to {values.max():g}, mean {values.mean():g}")

@@ -9,7 +9,7 @@ import numpy as np
 
 from .geometry import tet_volumes
 from .lungs import SIDES, Options, make_lungs
-from .mesh import LungMeshError
+from .mesh import MeshError
 from .msh import write_mesh
 from .picture import picture
 from .report import measures, print_report
@@ -85,25 +85,25 @@ def check_request(given, volume, stretch):
     """Refuse at once what cannot be met by far; stretch: of the template. What is left is checked on the lung itself."""
     least, largest = LUNG_VOLUMES
     if not least <= volume <= largest:
-        raise LungMeshError(f"--volume {volume:g} ml is outside {least:g} to {largest:g} ml; a mouse has 0.2 ml, a man 4000 ml.")
+        raise MeshError(f"--volume {volume:g} ml is outside {least:g} to {largest:g} ml; a mouse has 0.2 ml, a man 4000 ml.")
     for option, size in (("--size", given.size), ("--airway-size", given.airway_size)):
         if size and not 0.5 * stretch <= size <= 64 * stretch:
-            raise LungMeshError(f"{option} {size:g} mm is no size that a lung of {volume:g} ml can be meshed with; it takes about "
+            raise MeshError(f"{option} {size:g} mm is no size that a lung of {volume:g} ml can be meshed with; it takes about "
                                 f"{3 * stretch:.3g} to {32 * stretch:.3g} mm.")
     fewest, most = (volume * 1e3 / (TET * (size * stretch) ** 3) for size in (64, 2))
     if given.cells and not fewest <= given.cells <= most:
-        raise LungMeshError(f"--cells {given.cells} is outside {fewest:.0f} to {most:.2g}, what a lung of any volume can be meshed with.")
+        raise MeshError(f"--cells {given.cells} is outside {fewest:.0f} to {most:.2g}, what a lung of any volume can be meshed with.")
     wanted = given.cells or volume * 1e3 / (TET * (given.size or DEFAULT_SIZE * stretch) ** 3)
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if wanted * BYTES > memory:
-        raise LungMeshError(f"about {wanted:.2g} tetrahedra take {wanted * BYTES / 1e9:.2g} GB; this machine has {memory / 1e9:.2g} GB: "
+        raise MeshError(f"about {wanted:.2g} tetrahedra take {wanted * BYTES / 1e9:.2g} GB; this machine has {memory / 1e9:.2g} GB: "
                             "take fewer.")
 
 
 def filled_in(given):
     """The Options of a parsed command line, with the defaults that depend on the volume."""
     if given.size_field and (given.size or given.airway_size):
-        raise LungMeshError("--size and --airway-size have no meaning with --size-field; give --cells.")
+        raise MeshError("--size and --airway-size have no meaning with --size-field; give --cells.")
     volume = given.volume or DEFAULT_VOLUME[given.side]
     stretch = (volume / DEFAULT_VOLUME[given.side]) ** (1 / 3)
     check_request(given, volume, stretch)
@@ -112,7 +112,7 @@ def filled_in(given):
     for option, path, ending in (("--output", given.output, ".msh"), ("--picture", given.picture, ".png")):
         folder = os.path.dirname(path or "") or "."
         if path and not (path.endswith(ending) and os.path.isdir(folder) and os.access(folder, os.W_OK)):
-            raise LungMeshError(f"{option} {path} must be a {ending} file in a folder that can be written to.")
+            raise MeshError(f"{option} {path} must be a {ending} file in a folder that can be written to.")
     return Options(given.side, volume, size, given.airway, airway_size, given.bronchus_radius)
 
 
@@ -122,12 +122,12 @@ def with_cells(cells, make):
     for _ in range(6):
         try:
             mesh = make(factor)
-        except LungMeshError as error:
-            raise LungMeshError(f"--cells {cells} could not be reached: {error}") from error
+        except MeshError as error:
+            raise MeshError(f"--cells {cells} could not be reached: {error}") from error
         if abs(len(mesh.tets) / cells - 1) <= 0.1:
             return mesh
         factor *= (len(mesh.tets) / cells) ** 0.4
-    raise LungMeshError(f"no element size gives about {cells} tetrahedra with this airway; try another --airway-size.")
+    raise MeshError(f"no element size gives about {cells} tetrahedra with this airway; try another --airway-size.")
 
 
 def resized(options, factor):
@@ -141,7 +141,7 @@ def adapted(options, path, cells):
     field = read_size_field(path)
     volume = np.abs(tet_volumes(field.points, field.tets)).sum() / 1e3
     if abs(volume / options.volume - 1) > 0.01:
-        raise LungMeshError(f"--size-field {path} is of a lung of {volume:.0f} ml, not {options.volume:.0f} ml: give the "
+        raise MeshError(f"--size-field {path} is of a lung of {volume:.0f} ml, not {options.volume:.0f} ml: give the "
                             "options of the mesh that it ran on.")
     cells = cells or len(field.tets)
     sizes = field.sizes(cells)
@@ -166,11 +166,11 @@ def main(arguments):
         mesh = mesh_of(given, options)
         failures = print_report(mesh, measures(mesh))
         if failures:
-            raise LungMeshError("; ".join(failures) + ", so no mesh was written.")
+            raise MeshError("; ".join(failures) + ", so no mesh was written.")
         write_mesh(mesh, given.output, float(given.format), given.binary)
         if given.picture:
             picture(mesh, given.picture)
-    except LungMeshError as error:
+    except MeshError as error:
         print(f"lung_mesh: {error}", file=sys.stderr)
         return 1
     except MemoryError:

@@ -6,7 +6,7 @@ import numpy as np
 
 from .geometry import boundary_facets, enclosed_volume, facet_areas, tet_volumes
 from .iso_surface import iso_surface
-from .mesh import LungMeshError, Mesh, merged
+from .mesh import MeshError, Mesh, merged
 from .quality import MIN_DIHEDRAL, MIN_SICN, dihedral_angles, sicn
 from .shape import bronchi_distance, lung_shape
 from .sizes import follow, limit_near, take_smallest
@@ -47,14 +47,14 @@ def make_lungs(options):
 def check_sizes(options, scale):
     """Refuse element sizes that the lung cannot hold; scale: mm per template mm."""
     if not 3 * scale <= options.size <= 32 * scale:
-        raise LungMeshError(f"--size {options.size:g} mm is outside {3 * scale:.1f} to {32 * scale:.1f} mm, "
+        raise MeshError(f"--size {options.size:g} mm is outside {3 * scale:.1f} to {32 * scale:.1f} mm, "
                             "what a lung of this volume can be meshed with.")
     largest = AIRWAY_LARGEST[options.airway] * scale
     if not scale <= options.airway_size <= largest:
-        raise LungMeshError(f"--airway-size {options.airway_size:g} mm is outside {scale:.1f} to {largest:.1f} mm, "
+        raise MeshError(f"--airway-size {options.airway_size:g} mm is outside {scale:.1f} to {largest:.1f} mm, "
                             f"what --airway {options.airway} needs at this volume.")
     if not 5 <= options.bronchus_radius <= 11:
-        raise LungMeshError(f"--bronchus-radius {options.bronchus_radius:g} mm is outside 5 to 11 mm, what the hilum can hold.")
+        raise MeshError(f"--bronchus-radius {options.bronchus_radius:g} mm is outside 5 to 11 mm, what the hilum can hold.")
 
 
 def mesh_lung(side, shape, surface, scale, options):
@@ -95,7 +95,7 @@ def mesh_lung(side, shape, surface, scale, options):
         if worst > MIN_SICN and angle > MIN_DIHEDRAL:
             return named_lung(side, shape, nodes, tets, scale)
         problem = f"the {side} lung's worst cell is too flat (SICN {worst:.2f}, dihedral angle {angle:.1f} degrees)"
-    raise LungMeshError(problem + "; try another --size or --airway-size.")
+    raise MeshError(problem + "; try another --size or --airway-size.")
 
 
 def named_lung(side, shape, nodes, tets, scale):

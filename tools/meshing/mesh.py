@@ -37,5 +37,5 @@ def merged(lungs):
                 np.concatenate([lung.surfaces for lung in lungs]), names)
 
 
-class LungMeshError(Exception):
+class MeshError(Exception):
     """A request that cannot be met, or a mesh that fails a check, in one sentence."""

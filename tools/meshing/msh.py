@@ -4,8 +4,10 @@ import os
 import gmsh
 import numpy as np
 
+from shared.common import written_whole
+
 from .gmsh_model import gmsh_elements, gmsh_nodes, gmsh_session
-from .mesh import LungMeshError, Mesh
+from .mesh import MeshError, Mesh
 
 
 def write_mesh(mesh, path, version=4.1, binary=False, digits=6):
@@ -31,15 +33,10 @@ def write_mesh(mesh, path, version=4.1, binary=False, digits=6):
             number += len(cells)
         gmsh.option.setNumber("Mesh.MshFileVersion", version)
         gmsh.option.setNumber("Mesh.Binary", int(binary))
-        part = os.path.join(os.path.dirname(path), f"part_{os.getpid()}_{os.path.basename(path)}")
-        try:
+        with written_whole(path) as part:
             gmsh.write(part)
             if not is_whole(part):
-                raise LungMeshError(f"--output {path} cannot be written whole: free the disk, or choose another folder.")
-            os.replace(part, path)  # under its own name it is whole
-        finally:
-            if os.path.exists(part):
-                os.remove(part)
+                raise MeshError(f"--output {path} cannot be written whole: free the disk, or choose another folder.")
 
 
 def is_whole(path):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .geometry import tet_volumes
-from .mesh import LungMeshError
+from .mesh import MeshError
 from .sizes import SIZE_GROWTH
 
 # indicator in a run's fields -> order of the gradients in it: of P2 displacement, of P1 pressure
@@ -99,10 +99,10 @@ def read_size_field(path):
                 if name == "error_indicator_J":
                     whole = whole + dataset(item, "_whole")
     except (OSError, KeyError, IndexError, ValueError, AttributeError, xml.etree.ElementTree.ParseError) as error:
-        raise LungMeshError(f"--size-field {path} is not the fields.xdmf of a run with its HDF5 files ({error}).") from error
+        raise MeshError(f"--size-field {path} is not the fields.xdmf of a run with its HDF5 files ({error}).") from error
     errors = [(energies[name] / total, INDICATORS[name])
               for name, total in zip(INDICATORS, np.atleast_1d(whole)) if name in energies and total > 0]
     if not errors:
-        raise LungMeshError(f"--size-field {path} holds no error indicator: run with -output_fields_error_indicator.")
+        raise MeshError(f"--size-field {path} holds no error indicator: run with -output_fields_error_indicator.")
     corners, tets = np.unique(tets, return_inverse=True)
     return SizeField(points[corners], tets.reshape(-1, 4), errors)

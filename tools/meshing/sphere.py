@@ -5,14 +5,15 @@ import os
 import meshio
 import numpy as np
 
+from shared.common import written_whole
+
+from .geometry import FACES, orient
+from .mesh import MeshError
+
 SIDES = ["airway", "pleura", "x0", "y0", "z0"]
 BYTES = 1500     # of memory that a tetrahedron takes on the way
 FLATTEST = 1e-4  # volume / (longest edge)^3 below which a cell is as good as none
 RADII = (1e-3, 1e6)  # mm; coordinates are told apart by 1e-8 mm
-
-
-class SphereMeshError(Exception):
-    """A request that cannot be met, in one sentence."""
 
 
 def octant_directions(divisions):
@@ -54,14 +55,12 @@ def shell(divisions, layers, inner, outer, octant=False):
     n = len(directions)
     below = [np.stack([a, b, c, c + n]), np.stack([a, b, b + n, c + n]), np.stack([a, a + n, b + n, c + n])]
     tets = np.concatenate([np.concatenate(below, axis=1).T + k * n for k in range(layers)])
-    edges = points[tets[:, 1:]] - points[tets[:, :1]]
-    tets[np.linalg.det(edges) < 0, :2] = tets[np.linalg.det(edges) < 0, 1::-1]
-    return points, tets, radii
+    return points, orient(points, tets), radii
 
 
 def surfaces(points, tets, radii):
     """Boundary triangles and for each the number of its name in SIDES."""
-    faces = np.sort(tets[:, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]].reshape(-1, 3), axis=1)
+    faces = np.sort(tets[:, FACES].reshape(-1, 3), axis=1)
     faces, count = np.unique(faces, axis=0, return_counts=True)
     faces = faces[count == 1]
     distance = np.linalg.norm(points, axis=1)
@@ -74,13 +73,13 @@ def surfaces(points, tets, radii):
 def check(divisions, layers, inner, outer, octant):
     """Refuses what no mesh can be made of, before anything is made."""
     if divisions < 1 or layers < 1:
-        raise SphereMeshError(f"--divisions {divisions} and --layers {layers} must be at least 1")
+        raise MeshError(f"--divisions {divisions} and --layers {layers} must be at least 1")
     if not RADII[0] <= inner < outer <= RADII[1]:
-        raise SphereMeshError(f"--inner {inner:g} and --outer {outer:g} mm: it takes {RADII[0]:g} <= inner < outer <= {RADII[1]:g} mm")
+        raise MeshError(f"--inner {inner:g} and --outer {outer:g} mm: it takes {RADII[0]:g} <= inner < outer <= {RADII[1]:g} mm")
     tets = 3 * divisions ** 2 * layers * (1 if octant else 8)
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if tets * BYTES > memory:
-        raise SphereMeshError(f"--divisions {divisions} and --layers {layers} make {tets:.3g} tetrahedra, which take about "
+        raise MeshError(f"--divisions {divisions} and --layers {layers} make {tets:.3g} tetrahedra, which take about "
                               f"{tets * BYTES / 1e9:.3g} GB; this machine has {memory / 1e9:.3g} GB: take fewer")
 
 
@@ -89,7 +88,7 @@ def check_shape(points, tets):
     edges = points[tets[:, 1:]] - points[tets[:, :1]]
     longest = np.max([np.linalg.norm(points[tets[:, i]] - points[tets[:, j]], axis=1) for i in range(4) for j in range(i)], axis=0)
     if not (np.linalg.det(edges) / 6 > FLATTEST * longest ** 3).all():
-        raise SphereMeshError("the cells would be as good as flat: take layers and divisions that make them about as thick as wide, or "
+        raise MeshError("the cells would be as good as flat: take layers and divisions that make them about as thick as wide, or "
                               "radii that differ more")
 
 
@@ -102,12 +101,7 @@ def write(path, divisions, layers, inner=7.5, outer=72.5, octant=False):
     names = {name: np.array([i + 1, 2]) for i, name in enumerate(SIDES) if (side == i).any()}
     names["lung"] = np.array([len(SIDES) + 1, 3])
     tags = [side + 1, np.full(len(tets), len(SIDES) + 1)]
-    part = f"{path}.part"
-    try:
+    with written_whole(path) as part:
         meshio.write(part, meshio.Mesh(points, [("triangle", faces), ("tetra", tets)], field_data=names,
                                        cell_data={"gmsh:physical": tags, "gmsh:geometrical": tags}), "gmsh22", binary=False)
-        os.replace(part, path)  # under its own name it is whole
-    finally:
-        if os.path.exists(part):
-            os.remove(part)
     return len(tets)

@@ -13,7 +13,8 @@ Runs on Debian's python3-numpy and -meshio. Lengths in mm.
 """
 import argparse
 
-from .sphere import SphereMeshError, write
+from .mesh import MeshError
+from .sphere import write
 
 
 def main(arguments):
@@ -33,7 +34,7 @@ def main(arguments):
         parser.error(f"cannot write {given.output}: {error.strerror}")
     except MemoryError:
         parser.error("the memory is used up: take fewer divisions or layers")
-    except SphereMeshError as error:
+    except MeshError as error:
         parser.error(error)
     print(f"wrote {given.output}: {tets} tetrahedra")
     return 0

@@ -1,10 +1,11 @@
 """What the runs left: numbers, signals, fields."""
-import csv
 import json
 import re
 
 import h5py
 import numpy as np
+
+from shared.signals import columns
 
 from .cases import LUMEN
 
@@ -27,10 +28,7 @@ class Outcome:
         self.finished = (directory / "summary.json").exists()
         self.numbers = read_json(directory / ("summary.json" if self.finished else "failure.json"))
         path = directory / "signals.csv"
-        with open(path if path.exists() else directory / "signals.csv.part", newline="") as f:
-            rows = [row for row in csv.DictReader(f) if None not in row.values()]
-        self.signals = {name: np.array([row[name] if name == "phase" else float(row[name]) for row in rows])
-                        for name in rows[0]}
+        self.signals = columns(path if path.exists() else directory / "signals.csv.part")
         self.time, self.volume = self.signals["time_s"], self.signals["volume_ml"]
         self.pressure, self.flow = self.signals["airway_pressure_cmH2O"], self.signals["flow_ml_per_s"]
 

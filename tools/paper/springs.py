@@ -3,7 +3,6 @@ import matplotlib
 
 from .cases import PIP
 from .drawing import plt, save, write_csv
-from .laws import FREE_INFLATION
 from .tables import difference, markdown, stop_text
 
 
@@ -73,7 +72,7 @@ def table3_page(results):
         if not C_l:
             rows.append((law.label, law.lung_compliance, stop_text(outcome), "–", "–", "–"))
             continue
-        at_rest = outcome["reference_volume_ml"] * (FREE_INFLATION[law.label] - 1) / PIP
+        at_rest = outcome["reference_volume_ml"] * (law.inflation - 1) / PIP
         rows.append((law.label, law.lung_compliance, f"{C_l:.1f}", difference(C_l, law.lung_compliance),
                      f"{outcome['tidal_volume_ml']:.0f}", f"{at_rest:.0f}"))
     return markdown(["law", "C_l paper", "C_l pulmo", "difference", "V(1 s) ml", "V(∞)/P"], rows)

@@ -1,6 +1,8 @@
 """Words and rows of the page's tables."""
 import re
 
+from shared import common
+
 from .outcome import reason
 
 
@@ -10,9 +12,8 @@ def difference(value, paper):
 
 
 def markdown(header, rows):
-    """Lines of a Markdown table."""
-    lines = ["| " + " | ".join(header) + " |", "|" + " --- |" * len(header)]
-    return "\n".join(lines + ["| " + " | ".join(map(str, row)) + " |" for row in rows])
+    """A Markdown table."""
+    return "\n".join(common.markdown(header, rows))
 
 
 def end_text(outcome):

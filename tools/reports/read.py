@@ -1,19 +1,13 @@
 """What a run left, finished or not: signals and numbers, or one sentence on why there are none."""
-import csv
 import json
 import os
 import sys
 
+from shared.signals import whole_rows
+
 
 def fail(message):
     sys.exit(f"report: error: {message}")
-
-
-def whole_rows(path):
-    """Rows of a table; one that is not written to its end yet is left out."""
-    with open(path, newline="") as f:
-        text = f.read()
-    return list(csv.DictReader(text[:text.rfind("\n") + 1].splitlines()))
 
 
 def read_signals(directory):

@@ -1,4 +1,5 @@
 """What all tools share: places, environment, what the program offers, machine, tables."""
+import contextlib
 import csv
 import functools
 import os
@@ -18,6 +19,18 @@ PLAIN = "-predictor_increments 0 -snes_lag_jacobian 1 -snes_lag_preconditioner 1
 def fail(message):
     """Ends the program with one sentence."""
     sys.exit(f"tools/{Path(sys.argv[0]).name}: error: {message}")
+
+
+@contextlib.contextmanager
+def written_whole(path):
+    """A name beside that of a file: what is written there gets the file's own name when it is whole, else it goes away."""
+    part = os.path.join(os.path.dirname(path), f"part_{os.getpid()}_{os.path.basename(path)}")
+    try:
+        yield part
+        os.replace(part, path)
+    finally:
+        if os.path.exists(part):
+            os.remove(part)
 
 
 def processor():

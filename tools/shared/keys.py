@@ -16,7 +16,7 @@ import sys
 import time
 from pathlib import Path
 
-from .common import SOURCE, fail
+from .common import SOURCE, fail, written_whole
 from .common import environment as plain_environment
 
 LISTENED = ("PETSC_", "OMPI_MCA_", "PMIX_MCA_", "MPICH_", "UCX_", "OMP_", "OPENBLAS_", "GOTO_", "MKL_", "BLIS_", "HDF5_", "LD_", "MALLOC_",
@@ -148,11 +148,10 @@ def make_mesh(path, tool, words):
         return False
     path.parent.mkdir(parents=True, exist_ok=True)
     print(f"making {path.name} ...", flush=True)
-    part = path.with_name(f"part_{os.getpid()}_{path.name}")
-    run = subprocess.run([*command, "--output", part], capture_output=True, text=True)
-    if run.returncode:
-        fail((run.stderr.strip().splitlines() or [f"tools/{tool} failed"])[-1])
-    part.rename(path)  # under its own name it is whole
+    with written_whole(path) as part:
+        run = subprocess.run([*command, "--output", part], capture_output=True, text=True)
+        if run.returncode:
+            fail((run.stderr.strip().splitlines() or [f"tools/{tool} failed"])[-1])
     note_made(path, command)
     return True
 
