@@ -2,9 +2,6 @@
 """The tools beside the program: mesh generator, report, benchmarks."""
 import contextlib
 import csv
-import functools
-import importlib.machinery
-import importlib.util
 import io
 import json
 import os
@@ -24,6 +21,7 @@ sys.path.insert(0, os.path.join(pulmo.SOURCE, "tests/support"))
 import failed_tests  # noqa: E402
 from benchmarks import assembly, memory, operations, scaling  # noqa: E402
 from hardcases import gallery, page  # noqa: E402
+from meshing import lung_command, sphere_command  # noqa: E402
 from shared import common, keys  # noqa: E402
 
 
@@ -32,23 +30,12 @@ def tool(name, *arguments):
     return subprocess.run(command, env=pulmo.ENVIRONMENT, capture_output=True, text=True, timeout=300)
 
 
-@functools.cache
-def module_of(name):
-    """A tool as a module."""
-    sys.dont_write_bytecode = True
-    loader = importlib.machinery.SourceFileLoader(name, os.path.join(pulmo.SOURCE, "tools", name))
-    module = importlib.util.module_from_spec(importlib.util.spec_from_loader(name, loader))
-    sys.modules[name] = module
-    loader.exec_module(module)
-    return module
-
-
 def called(name, *arguments):
-    """What tool() gives, without a new Python: of a tool with main(arguments)."""
+    """What tool() gives, without a new Python: of a mesh maker."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
-            code = module_of(name).main([str(a) for a in arguments])
+            code = {"lung_mesh": lung_command, "sphere_mesh": sphere_command}[name].main([str(a) for a in arguments])
         except SystemExit as end:
             code = end.code
     return subprocess.CompletedProcess([name, *arguments], code, out.getvalue(), err.getvalue())
