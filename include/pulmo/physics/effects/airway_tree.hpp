@@ -114,7 +114,7 @@ public:
     return "branching airways that resist the flow to each surface (Pedley, Schroter & Sudlow 1970)";
   }
   std::string example() const override { return "-airway_tree star -airway_tree_resistance 5"; }
-  bool active() const override { return !file_.empty(); }
+  bool active() const override { return !file_.empty() && file_ != "off"; }
 
   PetscErrorCode declare(Options &options) override
   {
@@ -123,7 +123,7 @@ public:
     PetscCall(options.text("",
                            "table of branches (CSV: name, parent, length_mm, diameter_mm or "
                            "resistance_cmH2O_s_per_l, compliance_ml_per_cmH2O, surface, region; docs/airway_tree.md), "
-                           "or 'star': one branch from the opening to each surface",
+                           "or 'star': one branch from the opening to each surface; or 'off'",
                            file_));
     options.group(name(), "star", file_ == "star", "-airway_tree star");
     PetscCall(options.real("resistance", "cmH2O s/l", Range::not_negative(), "of each branch", resistance_));
