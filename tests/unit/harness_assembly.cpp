@@ -239,7 +239,6 @@ PetscErrorCode check_integrators(const Subject &subject, Findings &findings)
   Quiet::Said said;
   const PetscErrorCode code = build(other, subject.options() + "-petscfe_type basic", &said);
   if (code == PETSC_ERR_USER_INPUT && one_sentence(said.errors)) PetscFunctionReturn(PETSC_SUCCESS); // needs pulmo's
-  if (run.model().memory()) findings.push_back("-petscfe_type basic is not refused, though something is remembered");
   PetscCall(code);
   PetscCall(assemble(other, basic));
   if (own.pattern != basic.pattern)
