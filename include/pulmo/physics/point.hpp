@@ -232,11 +232,13 @@ Point make_point(PointState &storage, PetscInt Nf, PetscInt NfAux, const PetscIn
   const bool made = NfAux == precomputed_state, gas = Nf > pressure;
   if (!made) make_point_state(u_x + uOff_x[displacement], NfAux > 0 ? a_x + aOff_x[displacement] : nullptr, storage);
   Memory memory;
-  if constexpr (!std::is_empty_v<P>)
-    memory = constants::memory(!made ? PlaceMemory::find(x, c)
-                               : a_t ? *reinterpret_cast<const Memory *>(a_t)
-                                     : memory,
-                               owners_of<P>()[0], normal != nullptr, c);
+  if constexpr (!std::is_empty_v<P>) {
+    if (!made)
+      memory = PlaceMemory::find(x, c);
+    else if (a_t)
+      memory = *reinterpret_cast<const Memory *>(a_t);
+    if (memory.last) memory = constants::memory(memory, owners_of<P>()[0], normal != nullptr, c);
+  }
   return {made ? *reinterpret_cast<const PointState *>(a) : storage,
           u + uOff[displacement],
           gas ? u[uOff[pressure]] : 0,
@@ -329,7 +331,8 @@ template <class P>
 Point own_memory(Point point, const PetscScalar c[])
 {
   if constexpr (!std::is_empty_v<P>)
-    point.memory = constants::memory(point.memory, owners_of<P>()[0], point.normal != nullptr, c);
+    if (point.memory.last)
+      point.memory = constants::memory(point.memory, owners_of<P>()[0], point.normal != nullptr, c);
   point.constants = c;
   return point;
 }
