@@ -89,7 +89,7 @@ PetscErrorCode check_help(const Subject &subject, Findings &findings)
   PetscFunctionBeginUser;
   PetscCall(own_options(subject, own, text));
   for (const Shown &o : own) {
-    turns_on = turns_on || (o.name == option && o.unit == "on/off");
+    turns_on = turns_on || (o.name == option && (o.unit == "on/off" || o.help.find("off") != std::string::npos));
     if (o.name != option && o.name.rfind(option + "_", 0) != 0)
       findings.push_back("-help: " + o.name + " does not begin with " + option);
     if (o.unit.empty()) findings.push_back("-help: " + o.name + " has no unit");
