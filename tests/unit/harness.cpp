@@ -40,9 +40,13 @@ std::vector<std::string> laws(const Registry &registry)
   return names;
 }
 
-Subject subject_of(const Registry &registry, const std::vector<std::string> &names, std::size_t number)
+/// Laws, airways and schemes take turns from where the names tell: a new effect changes no scene of the others.
+Subject subject_of(const Registry &registry, const std::vector<std::string> &names, std::size_t turn)
 {
   const std::vector<std::string> law = laws(registry);
+  std::string all;
+  for (const std::string &name : names) all += name + " ";
+  const std::size_t number = static_cast<std::size_t>(constants::tag(all)) + turn;
   Subject s;
   s.registry = registry;
   s.effects = names;
@@ -77,7 +81,7 @@ std::string Subject::surroundings() const
 {
   const std::string breath = "-ventilator_inspiration 0.2 -ventilator_expiration 0.2 -ventilator_ramp 0.1 "
                              "-ventilator_settle off ",
-                    flow = "-ventilator vcv -ventilator_tidal_volume 0.1 -ventilator_flow_split ",
+                    flow = "-ventilator vcv -ventilator_tidal_volume 0.01 -ventilator_flow_split ",
                     gas = "-airflow -airflow_permeability 300 ",
                     holder = has(effects, "chest_wall") ? "" : "chest_wall";
   std::string s = "-dm_plex_filename " + source("meshes/cube_msh22_ascii.msh") +
@@ -128,12 +132,11 @@ std::vector<std::string> names_of_effects(const Registry &registry)
 std::vector<Subject> alone(const Registry &registry, const std::vector<std::string> &names, Findings &refused)
 {
   std::vector<Subject> list;
-  std::size_t number = 0;
   for (const std::string &name : names) {
     Findings complaints;
     for (std::size_t i = 0; i < std::size(all_airways); ++i) {
       std::string why;
-      Subject s = subject_of(registry, {name}, ++number);
+      Subject s = subject_of(registry, {name}, i);
       s.airway = all_airways[i];
       if (taken(s, why))
         list.push_back(s);
@@ -146,12 +149,11 @@ std::vector<Subject> alone(const Registry &registry, const std::vector<std::stri
   return list;
 }
 
-std::optional<Subject> together(const Registry &registry, const std::vector<std::string> &names, std::size_t number,
-                                Findings &refused)
+std::optional<Subject> together(const Registry &registry, const std::vector<std::string> &names, Findings &refused)
 {
   for (std::size_t i = 0; i < std::size(all_airways); ++i) {
     std::string why;
-    Subject s = subject_of(registry, names, number + i);
+    Subject s = subject_of(registry, names, i);
     if (taken(s, why)) return s;
     refused.push_back(why);
   }

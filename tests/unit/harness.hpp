@@ -48,9 +48,8 @@ Findings find(const Check &check, const Subject &subject);
 /// Each effect of @p names alone, with every law and airway in turn that takes it. @p refused: what pulmo said of those
 /// that no airway takes.
 std::vector<Subject> alone(const Registry &registry, const std::vector<std::string> &names, Findings &refused);
-/// Effects together, with a law and an airway that @p number chooses; nothing if pulmo refuses them in a sentence.
-std::optional<Subject> together(const Registry &registry, const std::vector<std::string> &names, std::size_t number,
-                                Findings &refused);
+/// Effects together, with a law and an airway that takes them; nothing if none does.
+std::optional<Subject> together(const Registry &registry, const std::vector<std::string> &names, Findings &refused);
 std::vector<std::string> names_of_effects(const Registry &registry);
 
 // ------------------------------------------------------------------------------------- what the checks are made of

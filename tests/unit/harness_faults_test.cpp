@@ -93,7 +93,7 @@ TEST(HarnessMeetings, AFaultThatShowsBesideAnotherEffectIsFound)
   const Check &jacobian = checks().front();
   Findings refused;
   for (const Subject &subject : alone(registry, {"test_bed"}, refused)) EXPECT_EQ(all_of(find(jacobian, subject)), "");
-  const auto pair = together(registry, {"test_bed", "gravity"}, 0, refused);
+  const auto pair = together(registry, {"test_bed", "gravity"}, refused);
   ASSERT_TRUE(pair);
   EXPECT_NE(all_of(find(jacobian, *pair)), "");
 }

@@ -16,10 +16,9 @@ struct Scenes {
     const Registry registry = Registry::standard();
     const std::vector<std::string> names = names_of_effects(registry);
     Findings unmet;
-    std::size_t number = 0;
     alone = test::alone(registry, names, refused);
     const auto meet = [&](const std::vector<std::string> &group) {
-      if (const auto s = test::together(registry, group, ++number, unmet)) together.push_back(*s);
+      if (const auto s = test::together(registry, group, unmet)) together.push_back(*s);
     };
     for (std::size_t i = 0; i < names.size(); ++i)
       for (std::size_t j = 0; j < i; ++j) meet({names[i], names[j]});
