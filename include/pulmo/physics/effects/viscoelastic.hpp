@@ -133,6 +133,25 @@ public:
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
+  /// Overstress relaxes as stress and stays as a load: without stiffness against shear nothing holds the shape.
+  PetscErrorCode check(const Options &options, const Mesh &, const SceneFacts &facts) override
+  {
+    constexpr PetscScalar rest[9] = {0}, least = 1e-6;
+    PointState state;
+    PetscScalar A[81]; // dP_iJ/dF_kL at 27 i + 9 k + 3 J + L
+
+    PetscFunctionBeginUser;
+    make_point_state(rest, nullptr, state);
+    facts.law->tangent(state, A);
+    if (std::abs(A[4]) < least * std::abs(A[0])) // P_xy by F_xy, P_xx by F_xx
+      PetscCall(
+          PetscPrintf(options.comm(),
+                      "pulmo: warning: -viscoelastic with -tissue %s: that law has no stiffness against shear, and "
+                      "what is left of relaxed stress can turn cells inside out; give another -tissue\n",
+                      facts.law->name()));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
   PetscErrorCode terms(Composition &c, const SceneFacts &facts) const override
   {
     using K = ViscoelasticKernels;
