@@ -138,7 +138,7 @@ PetscErrorCode AirwayNodes::setup(DM dm, const Mesh &mesh, const Elements &eleme
         PetscCall(DMPlexComputeCellGeometryFVM(dm, facet, &area, nullptr, nullptr));
         PetscCall(DMPlexGetTransitiveClosure(dm, facet, PETSC_TRUE, &n_closure, &closure));
         // the face, its edges, its vertices: a third each for the vertices of P1, for the edges of P2
-        const PetscInt nodes = elements.pressure == 1 ? 4 : 1;
+        const PetscInt nodes = elements.pressure_degree == 1 ? 4 : 1;
         for (PetscInt j = nodes; j < nodes + 3; ++j) share[closure[2 * j]] += area / 3;
         for (PetscInt j = 0; j < n_closure; ++j) {
           const PetscInt p = closure[2 * j];

@@ -332,7 +332,7 @@ PetscErrorCode Archive::global(const std::string &name, Vec X)
   if (model_.composition().common_gas_pressure() || model_.composition().n_scalars() > 0) { // they have no node
     std::vector<PetscReal> scalars;
     if (!reading_) PetscCall(model_.airway().scalars(X, scalars));
-    PetscCall(table(name + "/scalars", scalars, PetscReal(0), [](PetscReal &row, Cells &cells) { cells(row); }));
+    PetscCall(table(name + "/scalars", scalars, PetscReal(0), [](PetscReal &row, TableCells &cells) { cells(row); }));
     PetscCall(check(scalars.size() == 1 + model_.composition().n_scalars(), name + "/scalars"));
     if (reading_) PetscCall(model_.airway().set_scalars(X, scalars));
   }

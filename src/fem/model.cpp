@@ -3,6 +3,7 @@
 #include "pulmo/fem/pattern.hpp"
 #include "pulmo/fem/point_memory.hpp"
 #include "pulmo/mesh/mesh.hpp"
+#include "pulmo/mesh/shared_points.hpp"
 #include "pulmo/physics/parameter_fields.hpp"
 
 #include <algorithm>
@@ -16,7 +17,7 @@ Model::~Model() = default;
 
 PetscErrorCode Model::declare(Options &options, const Elements &elements)
 {
-  const PetscInt k = elements.displacement;
+  const PetscInt k = elements.displacement_degree;
 
   PetscFunctionBeginUser;
   quadrature_degree_ = 2 * k - 1;
@@ -161,26 +162,23 @@ PetscErrorCode Model::create_weak_form()
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-/// constraint_of[5 * point + component]: which constraint holds that component there, or -1; pressure is component 3,
-/// pressure steered by the ventilator component 4.
-PetscErrorCode Model::find_constraints(std::vector<PetscInt> &constraint_of)
+PetscErrorCode Model::find_holders(Holders &holders)
 {
-  PetscInt begin, end;
-  PetscSF sf;
+  PetscInt end;
   std::vector<PetscInt> facets;
 
   PetscFunctionBeginUser;
-  PetscCall(DMPlexGetChart(dm_, &begin, &end));
-  constraint_of.assign(static_cast<std::size_t>(5 * end), -1);
+  PetscCall(DMPlexGetChart(dm_, nullptr, &end));
+  for (std::vector<PetscInt> *list : holders.all()) list->assign(static_cast<std::size_t>(end), -1);
   const auto &constraints = composition().constraints();
   for (std::size_t k = 0; k < constraints.size(); ++k) {
     const Constraint &constraint = constraints[k];
     const auto hold = [&](PetscInt point) {
-      for (PetscInt c = 0; c < 3; ++c)
+      for (std::size_t c = 0; c < 3; ++c)
         if (constraint.component[c])
-          constraint_of[5 * point + (constraint.field == displacement ? c
-                                     : constraint.at_airway           ? 4
-                                                                      : 3)] = static_cast<PetscInt>(k);
+          (constraint.field == displacement ? holders.displacement[c]
+           : constraint.at_airway           ? holders.airway
+                                            : holders.pressure)[point] = static_cast<PetscInt>(k);
     };
     for (PetscInt vertex : constraint.vertices) hold(vertex);
     if (constraint.surface.empty()) continue;
@@ -193,22 +191,7 @@ PetscErrorCode Model::find_constraints(std::vector<PetscInt> &constraint_of)
     }
   }
   // an edge or vertex of a surface may be on a rank that has none of the surface's facets
-  PetscCall(DMGetPointSF(dm_, &sf));
-  PetscInt roots;
-  PetscCall(PetscSFGetGraph(sf, &roots, nullptr, nullptr, nullptr));
-  if (roots >= 0) {
-    std::vector<PetscInt> one(static_cast<std::size_t>(end));
-    for (PetscInt c = 0; c < 5; ++c) {
-      for (PetscInt p = begin; p < end; ++p) one[p] = constraint_of[5 * p + c];
-      std::vector<PetscInt> all = one;
-      PetscCall(PetscSFReduceBegin(sf, MPIU_INT, one.data(), all.data(), MPI_MAX));
-      PetscCall(PetscSFReduceEnd(sf, MPIU_INT, one.data(), all.data(), MPI_MAX));
-      one = all;
-      PetscCall(PetscSFBcastBegin(sf, MPIU_INT, all.data(), one.data(), MPI_REPLACE));
-      PetscCall(PetscSFBcastEnd(sf, MPIU_INT, all.data(), one.data(), MPI_REPLACE));
-      for (PetscInt p = begin; p < end; ++p) constraint_of[5 * p + c] = one[p];
-    }
-  }
+  for (std::vector<PetscInt> *list : holders.all()) PetscCall(combine_shared(dm_, MPI_MAX, *list));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -216,7 +199,8 @@ PetscErrorCode Model::create_section()
 {
   const auto &fields = composition().fields();
   const auto n_fields = static_cast<PetscInt>(fields.size());
-  std::vector<PetscInt> constraint_of, components, dofs, bc_field;
+  Holders holders;
+  std::vector<PetscInt> components, dofs, bc_field;
   std::vector<DMLabel> labels(fields.size(), nullptr);
   std::vector<ISHandle> owned;
   std::vector<IS> bc_components, bc_points;
@@ -224,7 +208,7 @@ PetscErrorCode Model::create_section()
   SectionHandle section;
 
   PetscFunctionBeginUser;
-  PetscCall(find_constraints(constraint_of));
+  PetscCall(find_holders(holders));
   PetscCall(DMPlexGetChart(dm_, &begin, &end));
   for (PetscInt f = 0; f < n_fields; ++f) {
     PetscFE fe;
@@ -239,9 +223,9 @@ PetscErrorCode Model::create_section()
   for (PetscInt p = begin; p < end; ++p) {
     int set = 0;
     for (int c = 0; c < 3; ++c)
-      if (constraint_of[5 * p + c] >= 0) set |= 1 << c;
+      if (holders.displacement[c][p] >= 0) set |= 1 << c;
     if (set) groups[{displacement, set}].push_back(p);
-    if (constraint_of[5 * p + 3] >= 0 && n_fields > pressure) groups[{pressure, 1}].push_back(p);
+    if (holders.pressure[p] >= 0 && n_fields > pressure) groups[{pressure, 1}].push_back(p);
   }
   // every rank passes the same groups in the same order
   for (PetscInt f = 0; f < std::min<PetscInt>(n_fields, 2); ++f)
@@ -277,7 +261,7 @@ PetscErrorCode Model::create_section()
   std::vector<std::array<PetscReal, 3>> x;
   for (PetscInt p = begin; p < end; ++p) {
     for (PetscInt c = 0; c < 4; ++c) {
-      const PetscInt k = constraint_of[5 * p + c], f = c < 3 ? displacement : pressure;
+      const PetscInt k = c < 3 ? holders.displacement[c][p] : holders.pressure[p], f = c < 3 ? displacement : pressure;
       PetscInt dof, offset;
       if (k < 0 || f >= n_fields) continue;
       PetscCall(PetscSectionGetFieldDof(section, p, f, &dof));
@@ -294,7 +278,7 @@ PetscErrorCode Model::create_section()
       }
     }
   }
-  PetscCall(find_airway(constraint_of));
+  PetscCall(find_airway(holders));
   PetscInt n_known;
   IS *rows;
   PetscCall(DMCreateFieldIS(dm_, &n_known, nullptr, &rows));
@@ -311,7 +295,7 @@ PetscErrorCode Model::add_symmetries(PetscSection section) const
   PetscSection known;
 
   PetscFunctionBeginUser;
-  if (composition().elements().displacement < 3) PetscFunctionReturn(PETSC_SUCCESS);
+  if (composition().elements().displacement_degree < 3) PetscFunctionReturn(PETSC_SUCCESS);
   PetscCall(DMClone(mesh_->dm(), plain.out())); // PETSc knows them for the sections that it makes
   PetscCall(compat::copy_fields(dm_, plain));
   PetscCall(DMCreateDS(plain));
@@ -324,11 +308,11 @@ PetscErrorCode Model::add_symmetries(PetscSection section) const
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Model::find_airway(const std::vector<PetscInt> &constraint_of)
+PetscErrorCode Model::find_airway(const Holders &holders)
 {
   std::vector<AirwayNodes::Group> groups;
   std::set<std::string> surfaces; // open, and no scalar of an effect is their pressure
-  std::vector<bool> held_as_airway(constraint_of.size() / 5);
+  std::vector<bool> held_as_airway(holders.airway.size());
   PetscInt scalar = 1; // after the pressure at the opening
 
   PetscFunctionBeginUser;
@@ -346,7 +330,7 @@ PetscErrorCode Model::find_airway(const std::vector<PetscInt> &constraint_of)
   for (const std::string &surface : surfaces) rest.surfaces.push_back({surface, ""});
   if (!rest.surfaces.empty()) groups.push_back(rest);
   for (std::size_t p = 0; p < held_as_airway.size(); ++p)
-    held_as_airway[p] = constraint_of[5 * p + 4] >= 0 && constraint_of[5 * p + 3] < 0;
+    held_as_airway[p] = holders.airway[p] >= 0 && holders.pressure[p] < 0;
   PetscCall(
       airway_.setup(dm_, *mesh_, composition().elements(), groups, open, held_as_airway, closes_rows_ ? scalar : 0));
   PetscFunctionReturn(PETSC_SUCCESS);

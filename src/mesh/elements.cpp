@@ -32,7 +32,7 @@ PetscErrorCode Elements::declare(Options &options)
 const char *Elements::name() const
 {
   const auto mine = [this](const Pair &pair) {
-    return pair.degrees.displacement == displacement && pair.degrees.pressure == pressure;
+    return pair.degrees.displacement_degree == displacement_degree && pair.degrees.pressure_degree == pressure_degree;
   };
   return std::find_if(pairs.begin(), pairs.end(), mine)->name;
 }

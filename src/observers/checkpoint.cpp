@@ -304,7 +304,7 @@ PetscErrorCode Checkpoint::persist_programme(Archive &archive)
   if (scene_.facts().ventilator) phases = scene_.facts().ventilator->phases();
   for (const Phase &phase : phases) names += phase.name + "\n";
   PetscCall(archive.text("programme_phases", names));
-  PetscCall(archive.table("programme", phases, Phase(), [&](Phase &phase, Cells &cells) {
+  PetscCall(archive.table("programme", phases, Phase(), [&](Phase &phase, TableCells &cells) {
     int control = phase.control == Control::flow;
     cells(phase.breath, phase.begin, phase.end, control, phase.from, phase.to, phase.ramp, phase.limit, phase.dt);
     phase.control = control ? Control::flow : Control::pressure;

@@ -114,7 +114,7 @@ PetscErrorCode EnergyAudit::persist(Archive &archive, Vec local)
 
   PetscFunctionBeginUser;
   empty.accounts.assign(accounts_.size(), 0);
-  PetscCall(archive.table("energy", rows_, empty, [](EnergyBalance &row, Cells &cells) {
+  PetscCall(archive.table("energy", rows_, empty, [](EnergyBalance &row, TableCells &cells) {
     cells(row.ventilator_work, row.exchanged, row.residual);
     for (double &sum : row.accounts) cells(sum);
   }));

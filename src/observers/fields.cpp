@@ -254,7 +254,8 @@ PetscErrorCode FieldWriter::persist(Archive &archive, Vec local)
     names += "\n";
   }
   PetscCall(archive.text("fields/files", names));
-  PetscCall(archive.table("fields/times_s", snapshots_, Snapshot(), [](Snapshot &s, Cells &cells) { cells(s.time); }));
+  PetscCall(
+      archive.table("fields/times_s", snapshots_, Snapshot(), [](Snapshot &s, TableCells &cells) { cells(s.time); }));
   PetscCall(archive.value("fields/count", count_));
   if (archive.reading()) {
     std::istringstream lines(names);

@@ -106,7 +106,7 @@ PetscErrorCode GravityAudit::observe(const StepReport &step)
 PetscErrorCode GravityAudit::persist(Archive &archive, Vec)
 {
   PetscFunctionBeginUser;
-  PetscCall(archive.table("gravity", rows_, Row(), [](Row &row, Cells &cells) {
+  PetscCall(archive.table("gravity", rows_, Row(), [](Row &row, TableCells &cells) {
     for (double &change : row.volume_change) cells(change);
     cells(row.gradient);
   }));

@@ -132,11 +132,12 @@ PetscErrorCode RegionAudit::persist(Archive &archive, Vec)
   const std::vector<RegionState> empty(volumes_.size());
 
   PetscFunctionBeginUser;
-  PetscCall(archive.table("regions", rows_, empty, [](std::vector<RegionState> &row, Cells &cells) {
+  PetscCall(archive.table("regions", rows_, empty, [](std::vector<RegionState> &row, TableCells &cells) {
     for (RegionState &s : row) cells(s.volume_change, s.mean_J, s.sd_J, s.mean_pressure, s.sd_pressure);
   }));
   if (scene_.facts().airflow && scene_.tissue().porosity_varies())
-    PetscCall(archive.table("least_porosity", least_porosity_, 0.0, [](double &row, Cells &cells) { cells(row); }));
+    PetscCall(
+        archive.table("least_porosity", least_porosity_, 0.0, [](double &row, TableCells &cells) { cells(row); }));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

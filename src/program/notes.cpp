@@ -151,7 +151,7 @@ PetscErrorCode check_damping(MPI_Comm comm, const Scene &scene, const Model &mod
 
   PetscFunctionBeginUser;
   if (!scene.facts().pressure_damping) PetscFunctionReturn(PETSC_SUCCESS);
-  const PetscReal h = scene.mesh().edge(), c = scene.facts().elements.displacement == 1 ? 4 : 6,
+  const PetscReal h = scene.mesh().edge(), c = scene.facts().elements.displacement_degree == 1 ? 4 : 6,
                   beta = constants::get<PressureDampingKernels::Parameters>(model.constants_at(0)).beta,
                   share = beta / (h * h / (c * model.modulus()));
   char fix[256];
@@ -223,7 +223,7 @@ PetscErrorCode warn_of_equal_order(MPI_Comm comm, const Scene &scene, const Mode
   const PetscReal half_edge = scene.mesh().edge() / 2;
 
   PetscFunctionBeginUser;
-  if (warned || !facts.airflow || facts.pressure_damping || elements.displacement > elements.pressure)
+  if (warned || !facts.airflow || facts.pressure_damping || elements.displacement_degree > elements.pressure_degree)
     PetscFunctionReturn(PETSC_SUCCESS);
   warned = scene.airflow().permeability_at_rest() * model.modulus() * dt < half_edge * half_edge;
   if (warned)

@@ -257,7 +257,8 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   PetscCall(look_ahead(comm, scene, run.model(), simulation, run.settle_note()));
   PetscCall(error_estimate.check(options, scene));
   const Elements &elements = scene.facts().elements;
-  PulmoUserCheck(!output.error_indicator() || (elements.displacement == 2 && elements.pressure == 1), comm,
+  PulmoUserCheck(!output.error_indicator() || (elements.displacement_degree == 2 && elements.pressure_degree == 1),
+                 comm,
                  "-output_fields_error_indicator recovers the stress of -elements P2-P1; leave one of the two out");
 
   SignalWriter signals(comm, output, scene.facts(), run.model().composition());

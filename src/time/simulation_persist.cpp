@@ -52,7 +52,7 @@ public:
   PetscErrorCode visit(const std::string &name, bool &value) override { return archive_.value(path_ + name, value); }
   PetscErrorCode visit(const std::string &name, std::vector<PetscReal> &values) override
   {
-    return archive_.table(path_ + name, values, PetscReal(0), [](PetscReal &row, Cells &cells) { cells(row); });
+    return archive_.table(path_ + name, values, PetscReal(0), [](PetscReal &row, TableCells &cells) { cells(row); });
   }
 
 private:
@@ -85,7 +85,7 @@ PetscErrorCode Simulation::persist_rows(Archive &archive)
   SignalRow empty;
   empty.scalars.assign(model_.composition().n_scalars(), 0);
   empty.scalar_flows = empty.scalars;
-  PetscCall(archive.table("signals", rows_, empty, [&](SignalRow &row, Cells &cells) {
+  PetscCall(archive.table("signals", rows_, empty, [&](SignalRow &row, TableCells &cells) {
     std::size_t phase = archive.reading() ? 0 : phases.number(row.phase);
     cells(row.time, row.pressure, row.flow, row.volume, phase, row.breath, row.dt, row.newton, row.krylov, row.min_J,
           row.max_J, row.hold, row.ventilator_pressure);

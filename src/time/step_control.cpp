@@ -34,7 +34,7 @@ PetscErrorCode StepControl::persist(Archive &archive)
 {
   PetscFunctionBeginUser;
   PetscCall(archive.table("step_control", past_, Value(),
-                          [](Value &v, Cells &cells) { cells(v.time, v.volume, v.pressure); }));
+                          [](Value &v, TableCells &cells) { cells(v.time, v.volume, v.pressure); }));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -88,7 +88,7 @@ PetscErrorCode TimeScheme::persist(Archive &archive, Model &model, const Moment 
     PetscCall(archive.value("time_scheme/volume_mm3", earlier.volume));
     if (model.composition().n_scalars() > 0)
       PetscCall(archive.table("time_scheme/scalars_kPa", earlier.scalars, 0.0,
-                              [](PetscReal &row, Cells &cells) { cells(row); }));
+                              [](PetscReal &row, TableCells &cells) { cells(row); }));
     PetscCall(VecDuplicate(last.local, state.out()));
     if (!archive.reading()) PetscCall(VecCopy(earlier_.state, state));
     PetscCall(archive.local("time_scheme/state", state));

@@ -34,10 +34,10 @@ protected:
   }
   std::array<double, 3> u(const double x[3]) const
   {
-    const PetscInt k = degrees_.displacement;
+    const PetscInt k = degrees_.displacement_degree;
     return {polynomial(k, x, 0.1), polynomial(k, x, -0.3), polynomial(k, x, 0.6)};
   }
-  double p(const double x[3]) const { return polynomial(degrees_.pressure, x, 0.2); }
+  double p(const double x[3]) const { return polynomial(degrees_.pressure_degree, x, 0.2); }
 
   const std::string directory_ = ::testing::TempDir() + "pulmo_elements";
   SceneRun run_{Registry::standard()};

@@ -14,9 +14,9 @@
 namespace pulmo {
 
 /// Visits numbers one after the other, to write or to read them.
-class Cells {
+class TableCells {
 public:
-  explicit Cells(bool reading, std::vector<double> &values) : reading_(reading), values_(values) {}
+  explicit TableCells(bool reading, std::vector<double> &values) : reading_(reading), values_(values) {}
 
   template <class... T>
   void operator()(T &...numbers)
@@ -84,7 +84,7 @@ public:
   {
     std::vector<double> values;
     std::size_t n = rows.size();
-    Cells cells(reading_, values);
+    TableCells cells(reading_, values);
 
     PetscFunctionBeginUser;
     if (reading_) {

@@ -92,12 +92,22 @@ private:
     PetscReal x[3]; ///< mm
   };
 
+  /// Which of the composition's constraints holds what at each mesh point; -1: none does.
+  struct Holders {
+    std::array<std::vector<PetscInt>, 3> displacement; ///< by component
+    std::vector<PetscInt> pressure, airway;            ///< prescribed; steered by the ventilator
+    std::array<std::vector<PetscInt> *, 5> all()
+    {
+      return {&displacement[0], &displacement[1], &displacement[2], &pressure, &airway};
+    }
+  };
+
   PetscErrorCode create_fields();
   PetscErrorCode create_weak_form();
   PetscErrorCode create_section();
   PetscErrorCode add_symmetries(PetscSection section) const;
-  PetscErrorCode find_constraints(std::vector<PetscInt> &constraint_of);
-  PetscErrorCode find_airway(const std::vector<PetscInt> &constraint_of);
+  PetscErrorCode find_holders(Holders &holders);
+  PetscErrorCode find_airway(const Holders &holders);
   PetscErrorCode pack_constants();
   PetscErrorCode add_volume_terms(PetscDS ds) const;
   /// PETSc's own loops over cells: constants are the same everywhere there.

@@ -11,7 +11,7 @@ namespace pulmo {
 /// Degrees of the Lagrange elements on tetrahedra (`-elements`). The pressure is one degree below the displacement
 /// (Taylor & Hood 1973), or both are linear: that pair is cheap, and not stable where the tissue is undrained.
 struct Elements {
-  PetscInt displacement = 2, pressure = 1;
+  PetscInt displacement_degree = 2, pressure_degree = 1;
 
   /// Declares -elements.
   PetscErrorCode declare(Options &options);

@@ -218,7 +218,7 @@ public:
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
-  void fields(Composition &c) const override { c.field("pressure", 1, c.elements().pressure, "kPa"); }
+  void fields(Composition &c) const override { c.field("pressure", 1, c.elements().pressure_degree, "kPa"); }
 
   PetscErrorCode terms(Composition &c, const SceneFacts &) const override
   {

@@ -65,10 +65,10 @@ public:
   {
     PetscFunctionBeginUser;
     PulmoUserCheck(facts.airflow, options.comm(), "-pressure_damping needs a pressure field: give -airflow");
-    PulmoUserCheck(facts.elements.pressure == 1, options.comm(),
+    PulmoUserCheck(facts.elements.pressure_degree == 1, options.comm(),
                    "-pressure_damping is for linear pressure: leave it out, or give -elements P2-P1 or P1-P1");
     const PetscReal h = length_ > 0 ? length_ : mesh.edge();
-    parameters_.beta = h * h / ((facts.elements.displacement == 1 ? 4 : 6) * modulus_);
+    parameters_.beta = h * h / ((facts.elements.displacement_degree == 1 ? 4 : 6) * modulus_);
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 

@@ -59,7 +59,7 @@ public:
     return PETSC_SUCCESS;
   }
 
-  void fields(Composition &c) const override { c.field("displacement", 3, c.elements().displacement, "mm"); }
+  void fields(Composition &c) const override { c.field("displacement", 3, c.elements().displacement_degree, "mm"); }
 
   PetscErrorCode terms(Composition &c, const SceneFacts &facts) const override
   {
