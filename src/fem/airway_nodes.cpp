@@ -131,6 +131,10 @@ PetscErrorCode AirwayNodes::setup(DM dm, const Mesh &mesh, const Elements &eleme
   for (std::size_t g = 0; g < groups.size(); ++g)
     for (const SurfacePart &part : groups[g].surfaces) {
       PetscCall(facets_of(mesh, part, facets));
+      auto n = static_cast<PetscInt>(facets.size());
+      PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &n, 1, MPIU_INT, MPI_SUM, comm_));
+      PulmoUserCheck(n > 0, comm_, "branch '%s' ends at %s, which has no facets: no gas gets into the lung there",
+                     groups[g].name.c_str(), part.text().c_str());
       found.insert(facets.begin(), facets.end());
       for (PetscInt facet : facets) {
         PetscInt *closure = nullptr, n_closure;
@@ -159,11 +163,11 @@ PetscErrorCode AirwayNodes::setup(DM dm, const Mesh &mesh, const Elements &eleme
     }
   }
   PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &left_out, 1, MPIU_REAL, MPI_SUM, comm_));
-  PulmoUserCheck(
-      left_out == 0, comm_,
-      "%.4g mm^2 of the airway are fed by no branch; give each surface of -airflow_surfaces, and each part of "
-      "the volume that it belongs to, a branch",
-      (double)left_out);
+  PulmoUserCheck(left_out == 0, comm_,
+                 "%.4g mm^2 of the airway are fed by no branch of -airway_tree; give each surface of "
+                 "-airflow_surfaces, and each part of "
+                 "the volume that it belongs to, a branch",
+                 (double)left_out);
   // a node may be on a rank that has none of the surface's facets
   PetscCall(combine_shared(dm, MPI_MAX, last));
   PetscCall(combine_shared(dm, MPI_MIN, first));
@@ -175,8 +179,9 @@ PetscErrorCode AirwayNodes::setup(DM dm, const Mesh &mesh, const Elements &eleme
     }
   PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, two, 2, MPIU_INT, MPI_MAX, comm_));
   PulmoUserCheck(two[0] < 0, comm_,
-                 "surfaces %s and %s touch, and a node cannot have the pressure of both; leave facets of another "
-                 "surface between them, or give them one branch",
+                 "branches '%s' and '%s' end at parts of the airway that touch (%s, %s), and a node cannot have the "
+                 "pressure of both; leave facets of another surface between them, or give them one branch",
+                 groups[std::max<PetscInt>(two[0], 0)].name.c_str(), groups[std::max<PetscInt>(two[1], 0)].name.c_str(),
                  groups[std::max<PetscInt>(two[0], 0)].surfaces.front().text().c_str(),
                  groups[std::max<PetscInt>(two[1], 0)].surfaces.front().text().c_str());
   for (PetscInt p = begin; p < end && !groups.empty(); ++p) {
@@ -239,10 +244,7 @@ PetscErrorCode AirwayNodes::find_homes(PetscInt scalars)
   if (rank == 0) before = 0;
   PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &all, 1, MPIU_INT, MPI_SUM, comm_));
   const auto homeless = static_cast<PetscInt>(std::count(first.begin(), first.end(), PETSC_MPI_INT_MAX));
-  PulmoUserCheck(homeless <= all, comm_,
-                 "%d scalar unknowns of this scene have no room: the airway has only %d nodes for them; refine its "
-                 "surfaces, or give fewer branches",
-                 (int)homeless, (int)all);
+  homeless_ = std::max<PetscInt>(homeless - all, 0);
   PetscInt next = 0; // of the rows that are left, and of the scalars without a home, both counted over all ranks
   std::vector<PetscInt> free;
   for (std::size_t i = 0; i < closed_.size(); ++i)

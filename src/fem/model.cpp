@@ -322,7 +322,7 @@ PetscErrorCode Model::find_airway(const Holders &holders)
   closes_rows_ = !surfaces.empty() || composition().common_gas_pressure();
   for (const ScalarGroup &group : composition().scalar_groups())
     for (const ScalarSpec &spec : group.scalars) {
-      if (!spec.surfaces.empty()) groups.push_back({spec.surfaces, scalar});
+      if (!spec.surfaces.empty()) groups.push_back({spec.name, spec.surfaces, scalar});
       for (const SurfacePart &part : spec.surfaces) surfaces.erase(part.surface);
       ++scalar;
     }

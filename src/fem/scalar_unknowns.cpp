@@ -1,6 +1,8 @@
 // Scalar unknowns in Newton's method.
 #include "pulmo/fem/scalar_unknowns.hpp"
 
+#include "pulmo/mesh/mesh.hpp"
+
 #include <algorithm>
 #include <cmath>
 
@@ -73,6 +75,7 @@ void ScalarUnknowns::begin(std::vector<PetscReal> values, bool unknown, PetscRea
   value_ = std::move(values);
   unknown_ = unknown;
   slope_ = slope;
+  scale_.clear();
   past_ = std::move(past);
   past_.resize(value_.size());
 }
@@ -117,12 +120,13 @@ ScalarUnknowns::Rows ScalarUnknowns::evaluate(const OpeningEquation &opening) co
   if (groups.empty()) return rows;
 
   const std::vector<ScalarState> seen = states();
-  const PetscReal scale = 1 / model_.modulus();
   for (std::size_t g = 0; g < groups.size(); ++g) {
     const std::size_t m = groups[g].scalars.size(), at = 1 + groups[g].offset;
     ScalarRows own(m);
     groups[g].equations(seen[g], own);
     for (std::size_t i = 0; i < m; ++i) {
+      const PetscReal scale = scale_of(at + i, own, i);
+      rows.unmet = std::max(rows.unmet, std::abs(own.value[i]));
       rows.c[at + i] = scale * own.value[i];
       rows.by_scalar[(at + i) * n] = scale * own.by_opening[i];
       for (std::size_t j = 0; j < m; ++j) {
@@ -134,6 +138,16 @@ ScalarUnknowns::Rows ScalarUnknowns::evaluate(const OpeningEquation &opening) co
   return rows;
 }
 
+PetscReal ScalarUnknowns::scale_of(std::size_t equation, ScalarRows &own, std::size_t row) const
+{
+  const PetscReal L = model_.composition().mesh().length();
+  PetscReal most = 0;
+  scale_.resize(size(), 0);
+  if (scale_[equation] > 0) return scale_[equation];
+  for (std::size_t j = 0; j < own.size(); ++j) most = std::max(most, std::abs(own.by_flow(row, j)));
+  return scale_[equation] = 1 / (model_.modulus() + most * slope_ * L * L * L);
+}
+
 PetscErrorCode ScalarUnknowns::close(const OpeningEquation &opening, PetscReal volume, Vec local_F, Vec F)
 {
   PetscFunctionBeginUser;
@@ -141,8 +155,7 @@ PetscErrorCode ScalarUnknowns::close(const OpeningEquation &opening, PetscReal v
   if (!unknown_) PetscFunctionReturn(PETSC_SUCCESS);
   if (of_effects()) PetscCall(model_.airway().flows(local_F, model_.row_scale(pressure), flow_));
   const Rows rows = evaluate(opening);
-  unmet_ = 0;
-  for (std::size_t i = 1; i < size(); ++i) unmet_ = std::max(unmet_, std::abs(rows.c[i]) * model_.modulus());
+  unmet_ = rows.unmet;
   if (!frozen_ && F) PetscCall(model_.airway().set_scalars(F, rows.c));
   PetscFunctionReturn(PETSC_SUCCESS);
 }

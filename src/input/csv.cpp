@@ -65,6 +65,7 @@ PetscErrorCode Csv::parse(MPI_Comm comm, const std::string &file, std::string te
     const std::string bare = trimmed(line);
     if (bare.empty() || bare.front() == '#') continue;
     const std::vector<std::string> cells = cells_of(line);
+    if (std::all_of(cells.begin(), cells.end(), [](const std::string &c) { return c.empty(); })) continue;
     if (table.columns_.empty()) {
       for (std::size_t i = 0; i < cells.size(); ++i) {
         PulmoUserCheck(std::find(known.begin(), known.end(), cells[i]) != known.end(), comm,

@@ -41,9 +41,10 @@ PetscErrorCode Airway::past(Past &past)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Airway::restore(Vec X) const
+PetscErrorCode Airway::restore(Vec X)
 {
   PetscFunctionBeginUser;
+  scalars_.begin(before_, false, 1, {});
   if (model_.composition().common_gas_pressure() || scalars_.of_effects())
     PetscCall(model_.airway().set_scalars(X, before_));
   PetscFunctionReturn(PETSC_SUCCESS);

@@ -150,7 +150,9 @@ PetscErrorCode Simulation::check_state()
   // another pressure may be prescribed at the rim of the airway, and is not the airway's
   const bool other = std::any_of(constraints.begin(), constraints.end(),
                                  [](const Constraint &c) { return c.field == pulmo::pressure && !c.at_airway; });
-  if (scene_.facts().airflow && scene_.facts().ventilator && !other && !airway_.scalars().of_effects())
+  if (airway_.scalars().of_effects())
+    pressure = airway_.scalars().opening();
+  else if (scene_.facts().airflow && scene_.facts().ventilator && !other)
     PetscCall(model_.airway().mean_pressure(before_, pressure));
   const PetscReal volume = measures.volume_change / units::mm3_per_ml, P = pressure / units::kPa_per_cmH2O,
                   lung = scene_.mesh().volume() / units::mm3_per_ml, modulus = model_.modulus() / units::kPa_per_cmH2O;

@@ -199,6 +199,10 @@ PetscErrorCode Simulation::create_solver()
       (scene_.facts().ventilator && scene_.facts().ventilator->prescribes_flow()))
     PetscCall(SNESSetConvergenceTest(snes, newton_converged, this, nullptr));
   if (scene_.facts().unknown_opening_pressure()) {
+    PulmoUserCheck(model_.airway().homeless() == 0, comm,
+                   "-airway_tree has more branches than the airway has nodes in the mesh (%d too many): refine the "
+                   "surfaces of -airflow_surfaces, or join branches that follow one another",
+                   (int)model_.airway().homeless());
     SNESLineSearch search;
     PetscBool newton;
     SNESType type;

@@ -111,7 +111,9 @@ class Case:
 
     def __init__(self, options, ranks=1, directory=None, timeout=300, launch=False, **process):
         self.directory = directory or scratch()
-        command, environment = [PROGRAM] + [str(o) for o in options], alone()
+        command = [PROGRAM] + [str(o) for o in options]
+        # another user may not write into our folders
+        environment = ENVIRONMENT if "user" in process else alone()
         if self.directory != "-":  # "-": the options tell
             command += ["-output_dir", self.directory]
         if ranks > 1 or launch:

@@ -542,7 +542,7 @@ class Tools(unittest.TestCase):
         row = assembly.roofline(20, {"flops": 120e3, "divisions": 40, "bytes": 30e3}, {"gflops": 60, "triad_gb": 10})
         self.assertEqual(dict(zip(assembly.ROOFLINE[2:], row))["attainable µs"], "3.00")
         self.assertEqual(row[-2:], ["6.7", "6.0"])
-        found = operations.shares(" 30.00%  [.] pulmo::Assembly::add_to_matrix\n 10.00%  [.] product_tile<5, 3>\n  5.00%  [k] idle\n")
+        found = operations.shares(" 30.00%  [.] pulmo::MatrixMap::add\n 10.00%  [.] product_tile<5, 3>\n  5.00%  [k] idle\n")
         self.assertAlmostEqual(found["insertion into the matrix"], 0.75)
 
     def test_machine_is_measured(self):

@@ -25,16 +25,19 @@ public:
   PetscErrorCode add_rows(DM dm, PetscInt scalars, PetscInt block, SectionHandle &section);
   /// What has one pressure, and the scalar that this is.
   struct Group {
+    std::string name; ///< of the scalar
     std::vector<SurfacePart> surfaces;
     PetscInt scalar = 0;
   };
   /// Finds the nodes once the section is in use. @p groups: all that is open to the ventilator, on the surfaces @p
   /// open;
   /// @p held_as_airway: by mesh point, whether the pressure there is the airway's. User error if a part of these
-  /// surfaces is in no group, or two groups touch. Collective.
+  /// surfaces is in no group, a group has none of them, or two groups touch. Collective.
   PetscErrorCode setup(DM dm, const Mesh &mesh, const Elements &elements, const std::vector<Group> &groups,
                        const std::vector<std::string> &open, const std::vector<bool> &held_as_airway, PetscInt scalars);
 
+  /// Scalars that no row is left for: these cannot be solved for.
+  PetscInt homeless() const { return homeless_; }
   /// The scalars that the fields see: the pressures of groups, and that of all gas where it has dofs of its own.
   std::vector<std::size_t> acting() const;
   PetscReal area() const { return area_; } ///< of all groups, mm^2
@@ -106,6 +109,7 @@ private:
   PetscMPIInt own_rank_ = 0;
   std::vector<PetscReal> value_; ///< of each scalar
   PetscReal area_ = 0;
+  PetscInt homeless_ = 0;
   bool held_ = true;
   MatHandle flux_rows_; ///< of the nodes that this rank owns, before they were closed
 };

@@ -68,6 +68,7 @@ private:
     std::vector<PetscReal> c, by_volume; ///< [equation]
     std::vector<PetscReal> by_scalar;    ///< [equation][scalar], fields fixed
     std::vector<PetscReal> by_flow;      ///< [equation][scalar whose surfaces it enters by]
+    PetscReal unmet = 0;                 ///< of the effects', the worst, kPa
   };
   Rows evaluate(const OpeningEquation &opening) const;
   /// d(volume, flows) along a change @p y of the fields and @p scalars of the scalars.
@@ -75,10 +76,14 @@ private:
                        std::vector<PetscReal> &flow);
   PetscErrorCode create_vectors(Vec like, Vec like_local);
   std::vector<PetscReal> storages() const;
+  /// What makes an effect's equation dimensionless, as the mass rows are in proportion to a flow: the same for a whole
+  /// attempt. A pressure behind a large resistance would else drown all other rows.
+  PetscReal scale_of(std::size_t equation, ScalarRows &own, std::size_t row) const;
 
   Model &model_;
   std::vector<PetscReal> value_ = {0}, past_ = {0}, flow_;
   PetscReal slope_ = 1, volume_ = 0, unmet_ = 0;
+  mutable std::vector<PetscReal> scale_; ///< of the equations in the attempt at hand; 0: not known yet
   bool unknown_ = false, frozen_ = false;
   std::vector<std::size_t> acting_; ///< scalars that the fields see: pressures of surfaces, or of all gas
   std::vector<VecHandle> column_, solution_;

@@ -11,8 +11,8 @@
 
 namespace pulmo {
 
-/// A table of text with named columns. Blanks around a cell and quotes around it do not count, empty lines and those
-/// that begin with # neither.
+/// A table of text with named columns. Blanks around a cell and quotes around it do not count; rows without anything
+/// and lines that begin with # neither.
 class Csv {
 public:
   /// Reads @p file, which @p option named; only the columns @p known may be there. Errors are user errors that name the

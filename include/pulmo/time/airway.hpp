@@ -44,8 +44,8 @@ public:
   void accept(const Attempt &attempt) override;
   /// What a step needs of the phase and of the steps before it; the phase was begun.
   PetscErrorCode past(Past &past) override;
-  /// After past() has read: puts scalars that have no node into a global vector.
-  PetscErrorCode restore(Vec X) const;
+  /// After past() has read: takes the scalars, and puts those that have no node into a global vector.
+  PetscErrorCode restore(Vec X);
 
   /// Puts the prescribed pressure, or the last known ones, into a global vector.
   PetscErrorCode guess(Vec X) const;

@@ -334,9 +334,17 @@ class Wrong(unittest.TestCase):
                 ([trachea, dict(right, diameter_mm="-1"), left], "diameter_mm is -1"),
                 ([trachea, dict(right, diameter_mm="1,5"), left], "cells"),
                 ([trachea, dict(right, diameter_mm="nan"), left], "must be a number"),
+                ([trachea, dict(right, diameter_mm="1e-90"), left], "no finite number"),
+                ([trachea, dict(right, compliance_ml_per_cmH2O="1e308"), left], "no finite number"),
+                ([trachea, dict(right, name="r\u00e4chts"), left], "one word"),
+                ([trachea, right, left, dict(left, name="dead", surface="soft_wall")], "'soft_wall'"),
                 ([dict(trachea, name="main stem"), dict(right, parent="main stem"), left], "one word")):
             with self.subTest(words):
                 self.refused(tree(branches), words)
+
+    def test_branches_that_end_nowhere(self):
+        dead = {"name": "dead", "parent": "trachea", "resistance_cmH2O_s_per_l": 5, "surface": "stiff", "region": "body_2"}
+        self.refused(tree(TRACHEA + [dead]) + ["-airflow_surfaces", "airway,stiff"], "'dead' ends at 'stiff' of 'body_2'")
 
     def test_scenes(self):
         table = tree(TRACHEA)

@@ -18,6 +18,7 @@
 #include "pulmo/physics/effect.hpp"
 
 #include <algorithm>
+#include <cctype>
 #include <cmath>
 
 namespace pulmo {
@@ -208,6 +209,13 @@ private:
   static constexpr PetscReal mm3_per_l = 1000 * units::mm3_per_ml;
   static constexpr const char *opening = "opening"; ///< as a parent in the table; so is an empty cell
 
+  static bool is_word(const std::string &text)
+  {
+    return std::all_of(text.begin(), text.end(), [](unsigned char c) {
+      return (c < 128 && std::isalnum(c)) || c == '_' || c == '-' || c == '.';
+    });
+  }
+
   /// Resistance of a branch from its size.
   void set_size(PetscReal length, PetscReal diameter, AirwayBranch &branch) const
   {
@@ -229,8 +237,9 @@ private:
     for (std::size_t row = 0; row < table_.rows(); ++row) {
       const std::string &own = table_.cell(row, "name"), where = table_.where(row);
       bool twice = false, bears = false;
-      PulmoUserCheck(!own.empty() && own != opening && own.find_first_of(" \t/") == std::string::npos, comm,
-                     "%s: a branch needs a name, one word other than '%s'", where.c_str(), opening);
+      PulmoUserCheck(!own.empty() && own != opening && is_word(own), comm,
+                     "%s: a branch needs a name, one word of letters, digits, '_', '-' and '.', and not '%s'",
+                     where.c_str(), opening);
       for (std::size_t other = 0; other < table_.rows(); ++other) {
         twice = twice || (other != row && table_.cell(other, "name") == own);
         bears = bears || table_.cell(other, "parent") == own;
@@ -279,6 +288,10 @@ private:
     else
       set_size(*length, *diameter, branch);
     branch.compliance = compliance.value_or(0) * units::mm3_per_ml / units::kPa_per_cmH2O;
+    PulmoUserCheck(std::isfinite(branch.resistance + branch.entrance + branch.compliance), comm,
+                   "%s: branch '%s' has a resistance or compliance that is no finite number; check its sizes and their "
+                   "units",
+                   table_.where(row).c_str(), branch.name.c_str());
     if (!table_.cell(row, "surface").empty())
       branch.surfaces = {{table_.cell(row, "surface"), table_.cell(row, "region")}};
     PetscFunctionReturn(PETSC_SUCCESS);
