@@ -335,8 +335,8 @@ std::optional<double> unsettled_volume(const std::vector<SignalRow> &rows)
   const std::size_t last = breaths.front().first;
   const SignalRow &end = rows[last], &before = rows[last - 1];
   if (!end.flow_resistance) return {};
-  if (end.flow == 0) return 0;
-  const double fading = last > 1 ? (before.flow / end.flow - 1) / end.dt : 0; // 1/s, of a step of backward Euler
+  if (std::abs(end.flow) * end.dt <= least_movement * end.rest_volume) return 0; // what fades there is rounding
+  const double fading = last > 1 ? (before.flow / end.flow - 1) / end.dt : 0;    // 1/s, of a step of backward Euler
   return std::abs(end.flow) * (fading > 0 ? 1 / fading : end.time);
 }
 
