@@ -16,7 +16,7 @@ import case_meshes
 import pulmo_case as pulmo
 
 sys.path.insert(0, os.path.join(pulmo.SOURCE, "tools"))
-from accuracy import (command, elements, extrapolate, fields, ladder, manufactured, numbers, page, pictures, search, settings,  # noqa: E402
+from accuracy import (command, elements, extrapolate, fields, ladder, laws, manufactured, numbers, page, pictures, search, settings,  # noqa: E402
                       sphere, truth)
 from accuracy.errors import Axes, estimate  # noqa: E402
 
@@ -219,14 +219,15 @@ class Searching(unittest.TestCase):
     def test_cost_of_element_pairs(self):
         """A quarter of the cost a cell, 0.9 of the error: errors go with h^2, cost with h^-3."""
         made, _ = self.explored(3000, pairs=("P2-P1", "P1-P1"))
+        law = laws.Law("birzle", "CM3", "C0")
         with mock.patch.object(elements, "KEYS", list(Known.LIMITS)), mock.patch.object(elements, "WANTED", (0.006, 0.01)):
-            header, rows = elements.factors({"birzle": made})
+            header, rows = elements.factors({law: made})
             self.assertEqual([(row[1], row[2]) for row in rows], [(name, share) for name in ("V_T", "C_rs") for share in ("0.6 %", "1 %")])
             *ratios, last = [row[-1] for row in rows]
             for ratio in ratios:
                 self.assertAlmostEqual(float(ratio), 4 * (1 / 0.9) ** 1.5, delta=0.6)
             self.assertEqual(last, "-", "the coarsest meshes meet it already")
-            header, rows = elements.table({"birzle": made})
+            header, rows = elements.table({law: made})
         self.assertEqual([(row[0], row[1]) for row in rows], [(pair, n) for pair in ("P2-P1", "P1-P1") for n in (1000, 2500, 6000, 15000)])
         for row, mesh in zip(rows, made.axes.meshes):
             h = mesh.size()
