@@ -113,52 +113,29 @@ PetscErrorCode closed_residual(SceneRun &run, State &s, Vec d, PetscReal h, Pets
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode compare_jacobian(SceneRun &run, State &s, const Stage &stage, Vec d, Findings &findings)
-{
-  constexpr PetscReal h = 1e-5, tolerated = 1e-7;
-  MatHandle A;
-  VecHandle product, forward, backward;
-  PetscReal scale, difference;
-
-  PetscFunctionBeginUser;
-  for (VecHandle *v : {&product, &forward, &backward}) PetscCall(VecDuplicate(d, v->out()));
-  PetscCall(run.model().create_matrix(A.out()));
-  PetscCall(run.model().set_step(stage, s.airway_pressure));
-  PetscCall(run.model().jacobian(s.t, s.x, s.x_t, stage.slope, A));
-  PetscCall(MatMult(A, d, product));
-  PetscCall(closed_residual(run, s, d, h, stage.slope, forward));
-  PetscCall(closed_residual(run, s, d, -h, stage.slope, backward));
-  PetscCall(VecAXPY(forward, -1, backward));
-  PetscCall(VecScale(forward, 0.5 / h));
-  PetscCall(VecNorm(forward, NORM_2, &scale));
-  PetscCall(VecAXPY(forward, -1, product));
-  PetscCall(VecNorm(forward, NORM_2, &difference));
-  if (!(scale > 0 && difference < tolerated * scale))
-    findings.push_back(std::string("the Jacobian under ") + (stage.multistep ? "BDF2" : "backward Euler") +
-                       " differs from that by differences by " + shown(difference / scale));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
 } // namespace
 
 PetscErrorCode check_jacobian(const Subject &subject, Findings &findings)
 {
+  constexpr PetscReal tolerated = 1e-7;
   SceneRun run(subject.registry);
   State s;
   VecHandle d;
-  PetscRandom numbers;
+  PetscReal difference, size;
 
   PetscFunctionBeginUser;
   PetscCall(build(run, subject.options()));
   run.model().airway().hold(subject.airway == Airway::held);
   PetscCall(random_state(run, static_cast<unsigned>(90 + subject.text().size()), s));
-  PetscCall(DMCreateGlobalVector(run.model().dm(), d.out()));
-  PetscCall(PetscRandomCreate(PETSC_COMM_WORLD, &numbers));
-  PetscCall(PetscRandomSetInterval(numbers, -1, 1));
-  PetscCall(VecSetRandom(d, numbers));
-  PetscCall(PetscRandomDestroy(&numbers));
+  PetscCall(random_direction(run, d));
   if (subject.airway == Airway::held) PetscCall(run.model().airway().set(d, 0)); // Newton never moves these
-  for (const Stage &stage : stages(s.dt)) PetscCall(compare_jacobian(run, s, stage, d, findings));
+  for (const Stage &stage : stages(s.dt)) {
+    const auto residual = [&](PetscReal h, Vec F) { return closed_residual(run, s, d, h, stage.slope, F); };
+    PetscCall(compare_jacobian(run, s, stage, d, residual, difference, size));
+    if (!(size > 0 && difference < tolerated * size))
+      findings.push_back(std::string("the Jacobian under ") + (stage.multistep ? "BDF2" : "backward Euler") +
+                         " differs from that by differences by " + shown(difference / size));
+  }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -206,6 +206,46 @@ inline PetscErrorCode residual_at(Run &run, State &s, Vec d, PetscReal h, PetscR
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+/// A random direction, entries between -1 and 1.
+inline PetscErrorCode random_direction(Run &run, VecHandle &d)
+{
+  PetscRandom numbers;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMCreateGlobalVector(run.model().dm(), d.out()));
+  PetscCall(PetscRandomCreate(PETSC_COMM_WORLD, &numbers));
+  PetscCall(PetscRandomSetInterval(numbers, -1, 1));
+  PetscCall(VecSetRandom(d, numbers));
+  PetscCall(PetscRandomDestroy(&numbers));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// By how much A d differs from the difference of residuals along d, and the size of that. @p residual(h, F): the
+/// residual of the state moved by h d.
+template <class Residual>
+PetscErrorCode compare_jacobian(Run &run, const State &s, const Stage &stage, Vec d, Residual residual,
+                                PetscReal &difference, PetscReal &size)
+{
+  constexpr PetscReal h = 1e-5;
+  MatHandle A;
+  VecHandle product, forward, backward;
+
+  PetscFunctionBeginUser;
+  for (VecHandle *v : {&product, &forward, &backward}) PetscCall(VecDuplicate(d, v->out()));
+  PetscCall(run.model().create_matrix(A.out()));
+  PetscCall(run.model().set_step(stage, s.airway_pressure));
+  PetscCall(run.model().jacobian(s.t, s.x, s.x_t, stage.slope, A));
+  PetscCall(MatMult(A, d, product));
+  PetscCall(residual(h, forward));
+  PetscCall(residual(-h, backward));
+  PetscCall(VecAXPY(forward, -1, backward));
+  PetscCall(VecScale(forward, 0.5 / h));
+  PetscCall(VecNorm(forward, NORM_2, &size));
+  PetscCall(VecAXPY(forward, -1, product));
+  PetscCall(VecNorm(forward, NORM_2, &difference));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 /// Field and mesh point of every global dof.
 inline PetscErrorCode places_of_dofs(Run &run, std::vector<PetscInt> &fields, std::vector<PetscInt> &points)
 {

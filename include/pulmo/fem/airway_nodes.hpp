@@ -29,10 +29,9 @@ public:
     std::vector<SurfacePart> surfaces;
     PetscInt scalar = 0;
   };
-  /// Finds the nodes once the section is in use. @p groups: all that is open to the ventilator, on the surfaces @p
-  /// open;
-  /// @p held_as_airway: by mesh point, whether the pressure there is the airway's. User error if a part of these
-  /// surfaces is in no group, a group has none of them, or two groups touch. Collective.
+  /// Finds the nodes once the section is in use. @p groups: all that is open to the ventilator. @p open: the surfaces
+  /// that are. @p held_as_airway: by mesh point, whether the pressure there is the airway's. User error if a part of
+  /// these surfaces is in no group, a group has none of them, or two groups touch. Collective.
   PetscErrorCode setup(DM dm, const Mesh &mesh, const Elements &elements, const std::vector<Group> &groups,
                        const std::vector<std::string> &open, const std::vector<bool> &held_as_airway, PetscInt scalars);
 
@@ -42,7 +41,6 @@ public:
   std::vector<std::size_t> acting() const;
   PetscReal area() const { return area_; } ///< of all groups, mm^2
   /// Whether the pressure is held (so at the start), or free.
-  bool held() const { return held_; }
   void hold(bool held) { held_ = held; }
   /// The pressure that each scalar stands for, kPa; by number of the scalar.
   void set_pressures(std::vector<PetscReal> scalars) { value_ = std::move(scalars); }

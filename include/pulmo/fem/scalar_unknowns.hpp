@@ -47,10 +47,8 @@ public:
   /// Begins an attempt at a stage: scalars start at @p values; d(value)/dt = @p slope (1/s) value + @p past (kPa/s).
   /// @p unknown: Newton solves for them; else the opening's is given and effects have none.
   void begin(std::vector<PetscReal> values, bool unknown, PetscReal slope, std::vector<PetscReal> past);
-  bool unknown() const { return unknown_; }
   /// Holds them at their last values for as long as @p frozen: the assembled Jacobian is that of the residual without
   /// them and their equations.
-  bool frozen() const { return frozen_; }
   void freeze(bool frozen) { frozen_ = frozen && unknown_; }
   /// Takes the values of a global vector where they are unknown.
   PetscErrorCode take(Vec X);

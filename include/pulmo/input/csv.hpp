@@ -24,7 +24,6 @@ public:
                               const std::vector<std::string> &known, Csv &table);
 
   std::size_t rows() const { return rows_.size(); }
-  bool has(const std::string &column) const { return columns_.count(column) > 0; }
   /// A cell; empty where the column is not there.
   const std::string &cell(std::size_t row, const std::string &column) const;
   /// FILE:LINE of a row.
