@@ -20,6 +20,9 @@
 #include <type_traits>
 #include <vector>
 
+/// What a kernel does not read of its point is then not made at all.
+#define PULMO_ALWAYS_INLINE [[gnu::always_inline]] inline
+
 namespace pulmo {
 
 /// Order of the fields that pulmo's kernels know. Displacement is always there, pressure only with airflow.
@@ -71,7 +74,7 @@ inline PetscInt offset_of(PetscScalar wanted, const PetscScalar c[])
 
 /// The parameter block of type @p P (a struct of PetscScalars that names its owner in `P::owner`).
 template <class P>
-P get(const PetscScalar c[])
+PULMO_ALWAYS_INLINE P get(const PetscScalar c[])
 {
   P p{};
   if constexpr (is_both<P>) {
@@ -224,7 +227,7 @@ namespace detail {
 /// The point of a callback. Its kinematic state is handed in by pulmo's integrator, or made here in @p storage
 /// (stock PetscFE, where auxiliary fields of the same discretisation carry u_t and p_t).
 template <class P>
-Point make_point(PointState &storage, PetscInt Nf, PetscInt NfAux, const PetscInt uOff[], const PetscInt uOff_x[],
+PULMO_ALWAYS_INLINE Point make_point(PointState &storage, PetscInt Nf, PetscInt NfAux, const PetscInt uOff[], const PetscInt uOff_x[],
                  const PetscScalar u[], const PetscScalar u_t[], const PetscScalar u_x[], const PetscInt aOff_x[],
                  const PetscScalar a[], const PetscScalar a_t[], const PetscScalar a_x[], PetscReal t, PetscReal shift,
                  const PetscReal x[], const PetscReal normal[], const PetscScalar c[])
