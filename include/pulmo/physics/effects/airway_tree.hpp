@@ -123,7 +123,7 @@ public:
     options.group(name(), about());
     PetscCall(options.text("",
                            "table of branches (CSV: name, parent, length_mm, diameter_mm or "
-                           "resistance_cmH2O_s_per_l, compliance_ml_per_cmH2O, surface, region; docs/airway_tree.md), "
+                           "resistance_cmH2O_s_per_l, compliance_ml_per_cmH2O, surface, region; docs/effects/airway_tree.md), "
                            "or 'star': one branch from the opening to each surface; or 'off'",
                            file_));
     options.group(name(), "star", file_ == "star", "-airway_tree star");
