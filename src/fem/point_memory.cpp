@@ -81,6 +81,12 @@ Memory PointMemory::Room::at(PetscInt i, PetscInt q) const
   return {last_.data() + first, other ? other->data() + first : nullptr};
 }
 
+Memory PointMemory::Room::accepted(PetscInt i, PetscInt q) const
+{
+  const std::vector<PetscScalar> &state = memory_->pending_ ? next_ : last_;
+  return {state.data() + static_cast<std::size_t>((i * points_ + q) * width_), nullptr};
+}
+
 PetscErrorCode PointMemory::evaluate(PetscReal t, const PetscScalar *x, const PetscScalar *rate, const Step &step,
                                      bool start, Room &r, std::vector<PetscScalar> &values) const
 {

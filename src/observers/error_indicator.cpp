@@ -1,6 +1,7 @@
 #include "pulmo/observers/error_indicator.hpp"
 
 #include "pulmo/base/units.hpp"
+#include "pulmo/fem/point_memory.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -241,6 +242,10 @@ PetscErrorCode ErrorIndicator::estimate(Vec local, CellErrors &errors)
 
   PetscFunctionBeginUser;
   const ReadArray x(local);
+  const PointMemory::Room *room = model_.memory() ? model_.memory()->room() : nullptr;
+  const auto accepted = [room](PetscInt cell, std::size_t q) {
+    return room ? room->accepted(cell, static_cast<PetscInt>(q)) : Memory();
+  };
   for (const Sampling::Element &e : cells) {
     const PetscScalar *constants = model_.constants_at(e.cell);
     const auto &weights = sampling_.weights(e);
@@ -249,7 +254,7 @@ PetscErrorCode ErrorIndicator::estimate(Vec local, CellErrors &errors)
     for (std::size_t q = 0; q < weights.size(); ++q) {
       const auto lambda = barycentric(e, samples[q].x);
       PetscScalar P[9];
-      law.stress(samples[q].state, constants, P);
+      law.stress(samples[q].state, constants, accepted(e.cell, q), P);
       for (int i = 0; i < 9; ++i) {
         mean[i] += weights[q] * P[i];
         for (int k = 0; k < 4; ++k) moments[k][i] += weights[q] * lambda[k] * P[i];
@@ -277,7 +282,7 @@ PetscErrorCode ErrorIndicator::estimate(Vec local, CellErrors &errors)
       const auto lambda = barycentric(e, s.x);
       const PetscReal w = weights[q] * e.measure * units::j_per_kPa_mm3, w_stress = w / (2 * model_.modulus());
       PetscScalar P[9], error[9];
-      law.stress(s.state, constants, P);
+      law.stress(s.state, constants, accepted(e.cell, q), P);
       stress_.evaluate(c, lambda.data(), error);
       for (int i = 0; i < 9; ++i) error[i] -= P[i];
       whole[0] += w_stress * contract(P, P);

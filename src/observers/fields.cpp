@@ -438,6 +438,7 @@ PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
   // cell means over the quadrature points; least J also at the corners, as in the signals
   std::vector<PointState> states;
   const auto &weights = assembly.relative_weights();
+  const PointMemory::Room *room = model_.memory() ? model_.memory()->room() : nullptr;
   for (PetscInt c = 0; c < assembly.cells(); ++c) {
     const PetscScalar *constants = model_.constants_at(c);
     assembly.point_states(c, x.data(), states);
@@ -445,7 +446,7 @@ PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
     for (std::size_t q = 0; q < weights.size(); ++q) {
       const PointState &s = states[q];
       PetscScalar P[9], sigma[9];
-      law.stress(s, constants, P);
+      law.stress(s, constants, room ? room->accepted(c, static_cast<PetscInt>(q)) : Memory(), P);
       for (int i = 0; i < 3; ++i)
         for (int j = 0; j < 3; ++j) // Cauchy: P F^T / J
           sigma[3 * i + j] =

@@ -3,6 +3,7 @@
 #include "pulmo/mesh/node_order.hpp"
 
 #include <algorithm>
+#include <cmath>
 #include <cstdint>
 #include <cstring>
 #include <numeric>
@@ -52,6 +53,31 @@ PetscErrorCode ParameterFields::setup(Options &options, const Composition &compo
     entries_.push_back(std::move(entry));
     offsets_.push_back(offset);
   }
+  for (const DerivedParameter &parameter : composition.derived()) PetscCall(derive(comm, composition, parameter));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode ParameterFields::derive(MPI_Comm comm, const Composition &composition, const DerivedParameter &parameter)
+{
+  const char *owner = nullptr;
+  const PetscInt offset = composition.constant_at(parameter.target, &owner);
+  std::vector<PetscScalar> constants = composition.constants(Step());
+  PetscInt begin, end, wrong = 0;
+  Entry entry;
+
+  PetscFunctionBeginUser;
+  PetscCheck(offset >= 0, comm, PETSC_ERR_ARG_WRONG, "a derived parameter is in no block that was handed over");
+  PetscCall(DMPlexGetHeightStratum(composition.mesh().dm(), 0, &begin, &end));
+  entry.everywhere = *parameter.target;
+  for (PetscInt c = 0; c < end - begin; ++c) {
+    patch(c, "", constants);
+    entry.of_cell.push_back(parameter.value(constants.data()));
+    if (std::isnan(entry.of_cell.back())) wrong = 1;
+  }
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &wrong, 1, MPIU_INT, MPI_MAX, comm));
+  PulmoUserCheck(!wrong, comm, "%s", parameter.complaint.c_str());
+  entries_.push_back(std::move(entry));
+  offsets_.push_back(offset);
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -57,9 +57,9 @@ PetscErrorCode reference_modulus(const TissueLaw &law, const Composition &compos
       for (int J = 0; J < 3; ++J) largest = std::max(largest, std::abs(A[27 * i + 9 * i + 4 * J]));
     return largest > 0 ? largest : 1;
   };
-  modulus = stiffness(nullptr);
-  if (!composition.varying()) PetscFunctionReturn(PETSC_SUCCESS);
   std::vector<PetscScalar> constants = composition.constants(Step());
+  modulus = stiffness(constants.data());
+  if (!composition.varying()) PetscFunctionReturn(PETSC_SUCCESS);
   modulus = PETSC_MAX_REAL;
   PetscCall(DMPlexGetHeightStratum(dm, 0, &begin, &end));
   for (PetscInt c = 0; c < end - begin; ++c) {

@@ -143,8 +143,9 @@ PetscErrorCode look_at_tissue(const Scene &scene, const Model &model, Vec local,
   std::vector<PointSample> samples;
 
   PetscFunctionBeginUser;
+  const std::vector<PetscScalar> all_over = model.composition().constants(model.step());
   make_point_state(zero, nullptr, state);
-  d.acoustic_at_rest = acoustic_stiffness(law, state).least;
+  d.acoustic_at_rest = acoustic_stiffness(law, state, true, all_over.data()).least;
   const auto lost = [&](PetscReal stiffness, PetscReal at_rest) {
     return stiffness < std::max<PetscReal>(no_stiffness * at_rest, 0) - rounding * model.modulus();
   };
@@ -177,10 +178,10 @@ PetscErrorCode look_at_tissue(const Scene &scene, const Model &model, Vec local,
   d.mean_J = 1 + sums[9] / sums[11];
   d.lost_share = sums[10] / sums[11];
   make_point_state(mean, nullptr, state);
-  d.acoustic = acoustic_stiffness(law, state).least;
+  d.acoustic = acoustic_stiffness(law, state, true, all_over.data()).least;
   d.acoustic_lost = lost(d.acoustic, d.acoustic_at_rest);
-  d.inflation = inflation_stiffness(law, d.mean_J);
-  d.inflation_lost = lost(d.inflation, inflation_stiffness(law, 1));
+  d.inflation = inflation_stiffness(law, d.mean_J, all_over.data());
+  d.inflation_lost = lost(d.inflation, inflation_stiffness(law, 1, all_over.data()));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

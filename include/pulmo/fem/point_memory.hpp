@@ -32,6 +32,8 @@ public:
     /// What kernels see at point @p q of place @p i; the next point's follows, width() apart. Cells are those of this
     /// rank, facets as Sampling::surface() has them.
     Memory at(PetscInt i, PetscInt q) const;
+    /// The last accepted state as its observers see it.
+    Memory accepted(PetscInt i, PetscInt q) const;
     /// The mesh points of the facets.
     const std::vector<PetscInt> &facets() const { return facets_; }
     /// The quadrature points of place @p i, [point][3], mm.

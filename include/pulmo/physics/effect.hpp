@@ -170,6 +170,13 @@ struct MemorySpec {
   PetscInt offset = 0;  ///< among the scalars of a point
 };
 
+/// A parameter of a kernel that follows from others, wherever these differ from place to place.
+struct DerivedParameter {
+  const PetscScalar *target;                                       ///< in a block of parameters
+  std::function<PetscScalar(const PetscScalar constants[])> value; ///< from what all effects handed over
+  std::string complaint;                                           ///< what a user reads where it is not a number
+};
+
 /// What the effects of a scene put together; filled by Effect::fields and Effect::terms.
 class Composition {
 public:
@@ -195,6 +202,10 @@ public:
   {
     parameters_.push_back({owner, data, count});
   }
+
+  /// Says that a parameter which was handed over follows from others, and how.
+  void derive(DerivedParameter parameter) { derived_.push_back(std::move(parameter)); }
+  const std::vector<DerivedParameter> &derived() const { return derived_; }
 
   /// A residual term of the volume, e.g. residual("P : Grad eta", displacement, f1(volume_residual<P, K::stress>)).
   template <class... Slots>
@@ -368,6 +379,7 @@ private:
   std::vector<Constraint> constraints_;
   std::vector<EnergyTerm> energies_;
   std::vector<ParameterBlock> parameters_;
+  std::vector<DerivedParameter> derived_;
   std::vector<Reader> readers_;
   std::vector<MemorySpec> memories_;
   std::vector<ScalarGroup> scalar_groups_;
@@ -405,14 +417,22 @@ struct GravityFacts {
   Callback<EnergyDensity> mass;    ///< of tissue and air at a point, kg per m^3 of reference volume (1e-3 g/ml)
 };
 
+/// A lung that is under pressure in the shape of the mesh, as others may know it.
+struct PrestressFacts {
+  PetscReal pressure = 0;                                         ///< transpulmonary, kPa
+  std::function<PetscReal(const PetscScalar constants[])> volume; ///< unloaded, over that of the mesh
+};
+
 /// What one effect may know of the scene beside itself.
 struct SceneFacts {
   Elements elements;
   const TissueLaw *law = nullptr;                ///< of the tissue
+  std::vector<StressFreeFunction> stress_free;   ///< where it is free of stress, if not in the shape of the mesh
   bool airflow = false;                          ///< the pressure field exists
   bool porosity = false;                         ///< a kernel or an observer reads the tissue's porosity (Porosity)
   const PermeabilityLaw *permeability = nullptr; ///< that the gas flows by; null without airflow
   std::optional<GravityFacts> gravity;
+  std::optional<PrestressFacts> prestress;
   std::vector<std::string> airway_surfaces;    ///< open to the ventilator; without airflow those that would be
   std::shared_ptr<const Programme> ventilator; ///< null without a ventilator
   Settling settling;

@@ -43,6 +43,8 @@ private:
 
   PetscErrorCode name_parts(MPI_Comm comm, const Composition &composition, const char *owner,
                             const Options::Varying &varying, const std::vector<Mesh::Region> &regions, Entry &entry);
+  /// Adds a parameter that follows from those before it.
+  PetscErrorCode derive(MPI_Comm comm, const Composition &composition, const DerivedParameter &parameter);
   PetscErrorCode take_dataset(Options &options, const Mesh &mesh, const Options::Varying &varying, Entry &entry);
   PetscReal value(const Entry &entry, PetscInt cell, const std::string &surface) const;
 

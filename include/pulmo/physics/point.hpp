@@ -198,12 +198,21 @@ struct Point {
 
   Memory memory{};                        ///< of the kernel's own effect
   const PetscScalar *constants = nullptr; ///< what all effects handed over (for LawFunctions)
+  Memory of_all{};                        ///< of all effects
 
   /// The share of the past in the rate of quantity @p i that the effect remembers: dy/dt = step.slope y + past(i).
   PetscScalar past(int i) const
   {
     return (memory.last ? step.last_weight * memory.last[i] : 0) +
            (memory.earlier ? step.earlier_weight * memory.earlier[i] : 0);
+  }
+  /// This point as the kernels of another effect see it, whose parameters are @p P, among @p c.
+  template <class P>
+  Point as_seen_by(const PetscScalar c[]) const
+  {
+    Point other = *this;
+    other.memory = constants::memory(of_all, P::owner, normal != nullptr, c);
+    return other;
   }
   /// Pressure of the gas in the pores: the local field, or the uniform pressure without airflow, kPa.
   PetscScalar gas_pressure() const { return grad_p ? p : step.gas_pressure; }
@@ -227,20 +236,21 @@ namespace detail {
 /// The point of a callback. Its kinematic state is handed in by pulmo's integrator, or made here in @p storage
 /// (stock PetscFE, where auxiliary fields of the same discretisation carry u_t and p_t).
 template <class P>
-PULMO_ALWAYS_INLINE Point make_point(PointState &storage, PetscInt Nf, PetscInt NfAux, const PetscInt uOff[], const PetscInt uOff_x[],
-                 const PetscScalar u[], const PetscScalar u_t[], const PetscScalar u_x[], const PetscInt aOff_x[],
-                 const PetscScalar a[], const PetscScalar a_t[], const PetscScalar a_x[], PetscReal t, PetscReal shift,
-                 const PetscReal x[], const PetscReal normal[], const PetscScalar c[])
+PULMO_ALWAYS_INLINE Point make_point(PointState &storage, PetscInt Nf, PetscInt NfAux, const PetscInt uOff[],
+                                     const PetscInt uOff_x[], const PetscScalar u[], const PetscScalar u_t[],
+                                     const PetscScalar u_x[], const PetscInt aOff_x[], const PetscScalar a[],
+                                     const PetscScalar a_t[], const PetscScalar a_x[], PetscReal t, PetscReal shift,
+                                     const PetscReal x[], const PetscReal normal[], const PetscScalar c[])
 {
   const bool made = NfAux == precomputed_state, gas = Nf > pressure;
   if (!made) make_point_state(u_x + uOff_x[displacement], NfAux > 0 ? a_x + aOff_x[displacement] : nullptr, storage);
-  Memory memory;
+  Memory memory, all;
   if constexpr (!std::is_empty_v<P>) {
     if (!made)
-      memory = PlaceMemory::find(x, c);
+      all = PlaceMemory::find(x, c);
     else if (a_t)
-      memory = *reinterpret_cast<const Memory *>(a_t);
-    if (memory.last) memory = constants::memory(memory, owners_of<P>()[0], normal != nullptr, c);
+      all = *reinterpret_cast<const Memory *>(a_t);
+    if (all.last) memory = constants::memory(all, owners_of<P>()[0], normal != nullptr, c);
   }
   return {made ? *reinterpret_cast<const PointState *>(a) : storage,
           u + uOff[displacement],
@@ -255,7 +265,8 @@ PULMO_ALWAYS_INLINE Point make_point(PointState &storage, PetscInt Nf, PetscInt 
           gas && u_t ? u_t[uOff[pressure]] : 0,
           gas && a_x && (made || NfAux > pressure) ? a_x + aOff_x[pressure] : nullptr,
           memory,
-          c};
+          c,
+          all};
 }
 
 template <class P, Kernel<P> K>
@@ -333,6 +344,7 @@ namespace detail {
 template <class P>
 Point own_memory(Point point, const PetscScalar c[])
 {
+  point.of_all = point.memory;
   if constexpr (!std::is_empty_v<P>)
     if (point.memory.last)
       point.memory = constants::memory(point.memory, owners_of<P>()[0], point.normal != nullptr, c);

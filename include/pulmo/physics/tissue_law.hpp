@@ -18,6 +18,7 @@
 
 #include "pulmo/physics/dual.hpp"
 #include "pulmo/physics/point.hpp"
+#include "pulmo/physics/stress_free.hpp"
 
 #include <cmath>
 #include <limits>
@@ -257,13 +258,61 @@ struct TissueKernels {
   }
 };
 
-/// A law's stress and tangent for kernels of other effects, with its parameters among the constants of PetscDS
-/// (Point::constants); they add to what they are given.
+/// A point of which a kernel reads no more than its state.
+static inline Point bare_point(const PointState &state)
+{
+  return {state, nullptr, 0, nullptr, 0, 0, nullptr, nullptr, {}};
+}
+
+/// The same kernels for tissue that is not free of stress in the shape of the mesh (pulmo/physics/stress_free.hpp).
+template <class Law>
+struct StrainedKernels {
+  using Kernels = TissueKernels<Law>;
+  using Parameters = Both<typename Law::Parameters, StressFree>;
+
+  static void stress(const Point &point, const Parameters &k, PetscScalar f1[])
+  {
+    const FeltState felt(point, point.state, k.other, When::now);
+    PetscScalar P[9] = {0};
+    Kernels::stress(bare_point(felt.state), k.own, P);
+    felt.add_stress(P, f1);
+  }
+  static void tangent(const Point &point, const Parameters &k, PetscScalar g3[])
+  {
+    const FeltState felt(point, point.state, k.other, When::now);
+    PetscScalar A[81] = {0};
+    Kernels::tangent(bare_point(felt.state), k.own, A);
+    felt.add_tangent(A, g3);
+  }
+  /// The stress-free shape at the start of the step is told by what @p now remembers.
+  static PetscScalar stored(const Point &now, const Point &before, const Parameters &k)
+  {
+    const FeltState end(now, now.state, k.other, When::now), start(now, before.state, k.other, When::accepted);
+    return Kernels::energy(end.state, k.own) / end.det - Kernels::energy(start.state, k.own) / start.det;
+  }
+  static PetscScalar numerical(const Point &now, const Point &before, const Parameters &k)
+  {
+    PetscScalar P[9] = {0}, D[9];
+    stress(now, k, P);
+    for (int i = 0; i < 9; ++i) D[i] = now.state.H[i] - before.state.H[i];
+    return contract(P, D) - stored(now, before, k);
+  }
+};
+
+/// A law's stress and tangent for kernels of other effects, with all parameters in Point::constants; they add to what
+/// they are given.
 struct LawFunctions {
-  using Stress = void (*)(const PointState &, const PetscScalar constants[], PetscScalar P[9]);
-  using Tangent = void (*)(const PointState &, const PetscScalar constants[], PetscScalar A[81]);
+  using Stress = void (*)(const Point &, PetscScalar P[9]);
+  using Tangent = void (*)(const Point &, PetscScalar A[81]);
   Stress stress;
   Tangent tangent;
+};
+
+/// Callbacks of the tissue's own terms.
+struct LawCallbacks {
+  Callback<PetscPointFunc> stress;
+  Callback<PetscPointJac> tangent;
+  Callback<EnergyDensity> stored, numerical;
 };
 
 /// A tissue law chosen at run time: its options, its parameters and its kernels.
@@ -275,21 +324,31 @@ public:
   virtual const char *source() const = 0;
   virtual PetscErrorCode declare(Options &options) = 0;
   virtual const PetscScalar *parameters(PetscInt *count) const = 0;
-  virtual Callback<PetscPointFunc> stress_callback() const = 0;
-  virtual Callback<PetscPointJac> tangent_callback() const = 0;
-  virtual Callback<EnergyDensity> stored_callback() const = 0;
-  virtual Callback<EnergyDensity> numerical_callback() const = 0;
-  virtual LawFunctions functions() const = 0;
+  /// @p strained: effects say where the tissue is free of stress.
+  virtual LawCallbacks callbacks(bool strained) const = 0;
+  virtual LawFunctions functions(bool strained) const = 0;
   /// The same law with all derivatives from its W by dual numbers (tests compare both).
   virtual std::unique_ptr<TissueLaw> energy_alone() const = 0;
   /// Strain energy density W at a state, kPa.
   virtual PetscScalar energy(const PointState &state) const = 0;
-  /// P' = dW/dF at a state, kPa, with the parameters among @p constants (Model::constants_at), or the law's own if
-  /// null.
-  virtual void stress(const PointState &state, const PetscScalar *constants, PetscScalar P[9]) const = 0;
-  void stress(const PointState &state, PetscScalar P[9]) const { stress(state, nullptr, P); }
+  /// P' in an accepted state, kPa. With @p constants (Model::constants_at): with the parameters and the stress-free
+  /// shape that they hold, of which effects know by @p accepted (PointMemory; of all of them); null: dW/dF with the
+  /// law's own parameters.
+  virtual void stress(const PointState &state, const PetscScalar *constants, const Memory &accepted,
+                      PetscScalar P[9]) const = 0;
   /// dP'/dF, kPa, stored [i][k][J][L].
-  virtual void tangent(const PointState &state, const PetscScalar *constants, PetscScalar A[81]) const = 0;
+  virtual void tangent(const PointState &state, const PetscScalar *constants, const Memory &accepted,
+                       PetscScalar A[81]) const = 0;
+  // what is remembered is that of the start
+  void stress(const PointState &state, const PetscScalar *constants, PetscScalar P[9]) const
+  {
+    stress(state, constants, {}, P);
+  }
+  void stress(const PointState &state, PetscScalar P[9]) const { stress(state, nullptr, P); }
+  void tangent(const PointState &state, const PetscScalar *constants, PetscScalar A[81]) const
+  {
+    tangent(state, constants, {}, A);
+  }
   void tangent(const PointState &state, PetscScalar A[81]) const { tangent(state, nullptr, A); }
 };
 
@@ -311,18 +370,13 @@ public:
     *count = sizeof(Parameters) / sizeof(PetscScalar);
     return reinterpret_cast<const PetscScalar *>(&parameters_);
   }
-  Callback<PetscPointFunc> stress_callback() const override { return volume_residual<Parameters, Kernels::stress>; }
-  Callback<PetscPointJac> tangent_callback() const override { return volume_jacobian<Parameters, Kernels::tangent>; }
-  Callback<EnergyDensity> stored_callback() const override { return energy_density<Parameters, Kernels::stored>; }
-  Callback<EnergyDensity> numerical_callback() const override { return energy_density<Parameters, Kernels::numerical>; }
-  LawFunctions functions() const override
+  LawCallbacks callbacks(bool strained) const override
   {
-    return {[](const PointState &s, const PetscScalar c[], PetscScalar P[9]) {
-              Kernels::stress(bare(s), constants::get<Parameters>(c), P);
-            },
-            [](const PointState &s, const PetscScalar c[], PetscScalar A[81]) {
-              Kernels::tangent(bare(s), constants::get<Parameters>(c), A);
-            }};
+    return strained ? callbacks_of<StrainedKernels<Law>>() : callbacks_of<Kernels>();
+  }
+  LawFunctions functions(bool strained) const override
+  {
+    return strained ? functions_of<StrainedKernels<Law>>() : functions_of<Kernels>();
   }
   std::unique_ptr<TissueLaw> energy_alone() const override
   {
@@ -332,23 +386,56 @@ public:
   PetscScalar energy(const PointState &state) const override { return Kernels::energy(state, parameters_); }
   using TissueLaw::stress;
   using TissueLaw::tangent;
-  void stress(const PointState &state, const PetscScalar *constants, PetscScalar P[9]) const override
+  void stress(const PointState &state, const PetscScalar *constants, const Memory &accepted,
+              PetscScalar P[9]) const override
   {
     for (int i = 0; i < 9; ++i) P[i] = 0;
-    Kernels::stress(bare(state), among(constants), P);
+    if (!constants) return Kernels::stress(bare_point(state), parameters_, P);
+    const auto parameters = constants::get<typename StrainedKernels<Law>::Parameters>(constants);
+    if (parameters.other.count == 0) return Kernels::stress(bare_point(state), parameters.own, P);
+    const FeltState felt(remembering(state, constants, accepted), state, parameters.other, When::accepted);
+    PetscScalar own[9] = {0};
+    Kernels::stress(bare_point(felt.state), parameters.own, own);
+    felt.add_stress(own, P);
   }
-  void tangent(const PointState &state, const PetscScalar *constants, PetscScalar A[81]) const override
+  void tangent(const PointState &state, const PetscScalar *constants, const Memory &accepted,
+               PetscScalar A[81]) const override
   {
     for (int i = 0; i < 81; ++i) A[i] = 0;
-    Kernels::tangent(bare(state), among(constants), A);
+    if (!constants) return Kernels::tangent(bare_point(state), parameters_, A);
+    const auto parameters = constants::get<typename StrainedKernels<Law>::Parameters>(constants);
+    if (parameters.other.count == 0) return Kernels::tangent(bare_point(state), parameters.own, A);
+    const FeltState felt(remembering(state, constants, accepted), state, parameters.other, When::accepted);
+    PetscScalar own[81] = {0};
+    Kernels::tangent(bare_point(felt.state), parameters.own, own);
+    felt.add_tangent(own, A);
   }
 
 private:
-  Parameters among(const PetscScalar *constants) const
+  static Point remembering(const PointState &state, const PetscScalar *constants, const Memory &accepted)
   {
-    return constants ? constants::get<Parameters>(constants) : parameters_;
+    Point point = bare_point(state);
+    point.constants = constants;
+    point.of_all = accepted;
+    return point;
   }
-  static Point bare(const PointState &state) { return {state, nullptr, 0, nullptr, 0, 0, nullptr, nullptr, {}}; }
+  template <class K>
+  static LawCallbacks callbacks_of()
+  {
+    using P = typename K::Parameters;
+    return {volume_residual<P, K::stress>, volume_jacobian<P, K::tangent>, energy_density<P, K::stored>,
+            energy_density<P, K::numerical>};
+  }
+  template <class K>
+  static LawFunctions functions_of()
+  {
+    using P = typename K::Parameters;
+    return {
+        [](const Point &point, PetscScalar stress[9]) { K::stress(point, constants::get<P>(point.constants), stress); },
+        [](const Point &point, PetscScalar tangent[81]) {
+          K::tangent(point, constants::get<P>(point.constants), tangent);
+        }};
+  }
 
   Parameters parameters_;
 };

@@ -65,15 +65,24 @@ public:
   {
     PetscInt count;
     const PetscScalar *parameters = law().parameters(&count);
+    const LawCallbacks of_law = law().callbacks(!facts.stress_free.empty());
 
     PetscFunctionBeginUser;
     c.parameters(name(), parameters, count);
     // the weak form of tissue and gas does without it: J and Phi0 + J - 1 have one rate
     if (facts.porosity || porosity_varies_) c.parameters(porosity_);
-    c.residual("P' : Grad eta", displacement, f1(law().stress_callback()));
-    c.jacobian("dP'/dF", displacement, displacement, g3(law().tangent_callback()));
-    c.energy(Energy::stored, "elastic_tissue", "", law().stored_callback());
-    c.energy(Energy::numerical, "numerical_dissipation", "", law().numerical_callback());
+    if (!facts.stress_free.empty()) {
+      PetscCheck(facts.stress_free.size() <= StressFree::most, PETSC_COMM_SELF, PETSC_ERR_ARG_OUTOFRANGE,
+                 "more than %d effects say where the tissue is free of stress", StressFree::most);
+      stress_free_.count = 0;
+      for (const StressFreeFunction function : facts.stress_free)
+        stress_free_.function[static_cast<int>(stress_free_.count++)] = constants::to_scalar(function);
+      c.parameters(stress_free_);
+    }
+    c.residual("P' : Grad eta", displacement, f1(of_law.stress));
+    c.jacobian("dP'/dF", displacement, displacement, g3(of_law.tangent));
+    c.energy(Energy::stored, "elastic_tissue", "", of_law.stored);
+    c.energy(Energy::numerical, "numerical_dissipation", "", of_law.numerical);
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
@@ -81,6 +90,7 @@ private:
   std::vector<std::unique_ptr<TissueLaw>> laws_;
   std::size_t chosen_ = 0;
   Porosity porosity_;
+  mutable StressFree stress_free_; ///< packed for the kernels by terms()
   bool porosity_varies_ = false;
 };
 

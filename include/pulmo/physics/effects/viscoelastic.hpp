@@ -44,7 +44,7 @@ struct ViscoelasticKernels {
   {
     const PetscScalar *cof = point.state.cof_F;
     PetscScalar P[9] = {0};
-    constants::to_pointer<LawFunctions::Stress>(k.stress)(point.state, point.constants, P);
+    constants::to_pointer<LawFunctions::Stress>(k.stress)(point, P);
     for (int m = 0; m < tensor; ++m) { // F^-1 = cof^T / J
       const int I = row[m], J = column[m];
       S[m] = (cof[I] * P[J] + cof[3 + I] * P[3 + J] + cof[6 + I] * P[6 + J]) / point.state.J;
@@ -82,7 +82,7 @@ struct ViscoelasticKernels {
   {
     const State s = overstress(point, k);
     PetscScalar A[81] = {0};
-    constants::to_pointer<LawFunctions::Tangent>(k.tangent)(point.state, point.constants, A);
+    constants::to_pointer<LawFunctions::Tangent>(k.tangent)(point, A);
     for (int i = 0; i < 81; ++i) g3[i] += s.c * A[i];
     for (int i = 0; i < 3; ++i)
       for (int J = 0; J < 3; ++J)
@@ -160,7 +160,7 @@ public:
     std::vector<Quantity> quantities;
 
     PetscFunctionBeginUser;
-    const LawFunctions law = facts.law->functions();
+    const LawFunctions law = facts.law->functions(!facts.stress_free.empty());
     parameters_.branches = static_cast<PetscScalar>(branches_);
     parameters_.stress = constants::to_scalar(law.stress);
     parameters_.tangent = constants::to_scalar(law.tangent);
