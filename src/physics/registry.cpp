@@ -6,6 +6,7 @@
 #include "pulmo/physics/effects/gravity.hpp"
 #include "pulmo/physics/effects/lumen_pressure.hpp"
 #include "pulmo/physics/effects/pressure_damping.hpp"
+#include "pulmo/physics/effects/prestress.hpp"
 #include "pulmo/physics/effects/support.hpp"
 #include "pulmo/physics/effects/traction.hpp"
 #include "pulmo/physics/effects/tube.hpp"
@@ -35,6 +36,7 @@ Registry Registry::standard()
   r.effect<Gravity>();
   r.effect<LumenPressure>();
   r.effect<PressureDamping>();
+  r.effect<Prestress>();
   r.effect<Support>();
   r.effect<Traction>();
   r.effect<Tube>();

@@ -1,0 +1,205 @@
+/// @file
+/// Effect `prestress`: the mesh is a lung under a transpulmonary pressure p_tp, as it was imaged, and not one at rest.
+///
+/// The tissue is that of a smaller lung, inflated by J0 the same way in all directions: its law is that of F F0,
+/// F0 = J0^(1/3) I, and J0 is what p_tp makes of a free piece of it, W'(J0) = p_tp. What held the lung in that shape
+/// goes on to pull on its whole boundary as a follower, t = p_tp J F^-T N: a pleural pressure of -p_tp. As
+/// Div cof F = 0 this is, inside the lung,
+///   P = (dW/dF)(F F0) F0^T / J0 - p_tp cof F,
+/// which is zero at u = 0 in every point of any mesh. Porosity, permeability and springs are those of the mesh.
+/// A uniform stretch is the simplest of the states that Govindjee & Mihalic (1996) and Patte, Genet & Chapelle (2022)
+/// look for.
+#pragma once
+
+#include "pulmo/base/units.hpp"
+#include "pulmo/mesh/mesh.hpp"
+#include "pulmo/physics/effect.hpp"
+
+#include <limits>
+
+namespace pulmo {
+
+/// The uniform inflation of a free piece of tissue, and its pressure.
+class FreeInflation {
+public:
+  /// @p constants: with the parameters of the law (TissueLaw::functions), or null for the law's own.
+  FreeInflation(const TissueLaw &law, const PetscScalar *constants) : law_(law), constants_(constants) {}
+
+  /// W'(J), kPa.
+  PetscReal pressure(PetscReal J) const
+  {
+    const PetscReal stretch = std::cbrt(J);
+    PetscScalar H[9] = {0}, P[9] = {0};
+    PointState state;
+    for (int i = 0; i < 9; i += 4) H[i] = stretch - 1;
+    make_point_state(H, nullptr, state);
+    if (constants_) {
+      Point point = bare_point(state);
+      point.constants = constants_;
+      law_.functions(false).stress(point, P);
+    } else {
+      law_.stress(state, P);
+    }
+    return P[0] / (stretch * stretch);
+  }
+  /// J on the way from rest on which pressure grows with J, or no number where that way ends before; @p last: the
+  /// pressure that it ends at.
+  PetscReal volume_at(PetscReal wanted, PetscReal *last = nullptr) const
+  {
+    constexpr PetscReal step = 1e-3, most = 20;
+    const bool up = wanted >= pressure(1);
+    PetscReal J = 1, p = pressure(1), next = 1;
+    if (last) *last = p;
+    for (; up ? p < wanted : p > wanted; J = next) {
+      next = up ? J * (1 + step) : J / (1 + step);
+      const PetscReal q = pressure(next);
+      if (!(up ? q > p : q < p) || !(next < most) || !(next > 1 / most))
+        return std::numeric_limits<double>::quiet_NaN();
+      p = q;
+      if (last) *last = p;
+    }
+    PetscReal low = up ? J / (1 + step) : J, high = up ? J : J * (1 + step);
+    if (J == 1) return 1;
+    for (int i = 0; i < 60; ++i) {
+      const PetscReal middle = (low + high) / 2;
+      (pressure(middle) < wanted ? low : high) = middle;
+    }
+    return (low + high) / 2;
+  }
+
+private:
+  const TissueLaw &law_;
+  const PetscScalar *constants_;
+};
+
+struct PrestressKernels {
+  struct Parameters {
+    static constexpr const char *owner = "prestress";
+    PetscScalar pressure = 0; ///< p_tp, kPa
+    PetscScalar stretch = 1;  ///< J0^(1/3)
+  };
+
+  static void stress_free(const Point &, const PetscScalar constants[], When, PetscScalar G[9])
+  {
+    const auto k = constants::get<Parameters>(constants);
+    for (int i = 0; i < 9; ++i) G[i] *= k.stretch;
+  }
+
+  /// f1 = -p_tp cof F.
+  static void follower(const Point &point, const Parameters &k, PetscScalar f1[])
+  {
+    for (int i = 0; i < 9; ++i) f1[i] -= k.pressure * point.state.cof_F[i];
+  }
+  static void follower_by_displacement(const Point &point, const Parameters &k, PetscScalar g3[])
+  {
+    add_cofactor_derivative(point.state.F, -k.pressure, g3);
+  }
+  /// Work of the pleural pressure in a step: p_tp dJ, kPa.
+  static PetscScalar work(const Point &now, const Point &before, const Parameters &k)
+  {
+    return k.pressure * (now.state.J_minus_1 - before.state.J_minus_1);
+  }
+  /// The momentum balance has cof F : dF instead of dJ.
+  static PetscScalar numerical(const Point &now, const Point &before, const Parameters &k)
+  {
+    PetscScalar D[9];
+    for (int i = 0; i < 9; ++i) D[i] = now.state.H[i] - before.state.H[i];
+    return k.pressure * volume_beyond_linear(now.state.F, D);
+  }
+};
+
+class Prestress final : public Effect {
+public:
+  const char *name() const override { return "prestress"; }
+  const char *about() const override { return "the mesh is a lung under transpulmonary pressure (uniform stretch)"; }
+  std::string example() const override { return "-prestress -prestress_pressure 2"; }
+  bool active() const override { return on_; }
+
+  PetscErrorCode declare(Options &options) override
+  {
+    PetscFunctionBeginUser;
+    options.group(name(), about());
+    PetscCall(options.flag("", "the mesh is a lung under pressure, not one at rest", on_));
+    options.group(name(), about(), on_, "-prestress");
+    PetscCall(options.real("pressure", "cmH2O", Range::any(),
+                           "transpulmonary pressure (alveolar less pleural) in the shape of the mesh; pressures of the "
+                           "run are counted from the alveolar pressure of that shape",
+                           pressure_));
+    PetscCall(options.choice("method", {"stretch"}, "how the unloaded lung is found: a uniform stretch", method_));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+  PetscErrorCode announce(SceneFacts &facts) override
+  {
+    facts.stress_free.push_back(PrestressKernels::stress_free);
+    facts.prestress = PrestressFacts{pressure_ * units::kPa_per_cmH2O, [](const PetscScalar constants[]) {
+                                       const auto k = constants::get<PrestressKernels::Parameters>(constants);
+                                       return 1 / (k.stretch * k.stretch * k.stretch);
+                                     }};
+    return PETSC_SUCCESS;
+  }
+
+  PetscErrorCode check(const Options &options, const Mesh &, const SceneFacts &facts) override
+  {
+    const FreeInflation free(*facts.law, nullptr);
+    PetscReal last, J0;
+
+    PetscFunctionBeginUser;
+    parameters_.pressure = facts.prestress->pressure;
+    J0 = free.volume_at(parameters_.pressure, &last);
+    PulmoUserCheck(!std::isnan(J0), options.comm(),
+                   "-prestress_pressure %g cmH2O: -tissue %s with these parameters takes no more than %.3g cmH2O from "
+                   "rest by uniform inflation; give a pressure below that, another law, or other parameters",
+                   (double)pressure_, facts.law->name(), (double)(last / units::kPa_per_cmH2O));
+    parameters_.stretch = std::cbrt(J0);
+    const PetscReal stiffness = slope(free, J0), at_rest = slope(free, 1);
+    if (stiffness < nearly_neutral * at_rest)
+      PetscCall(PetscPrintf(options.comm(),
+                            "pulmo: warning: -tissue %s is nearly neutral at -prestress_pressure %g cmH2O: dp/dJ is "
+                            "%.3g cmH2O there, %.3g at rest, and the unloaded lung has %.3g of the volume; small "
+                            "changes of pressure or parameters move these numbers far\n",
+                            facts.law->name(), (double)pressure_, (double)(stiffness / units::kPa_per_cmH2O),
+                            (double)(at_rest / units::kPa_per_cmH2O), (double)(1 / J0)));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+  PetscErrorCode terms(Composition &c, const SceneFacts &facts) const override
+  {
+    using K = PrestressKernels;
+    using P = K::Parameters;
+    const TissueLaw &law = *facts.law;
+
+    PetscFunctionBeginUser;
+    c.parameters(parameters_);
+    c.derive({&parameters_.stretch,
+              [&law](const PetscScalar constants[]) {
+                const auto k = constants::get<P>(constants);
+                return std::cbrt(FreeInflation(law, constants).volume_at(k.pressure));
+              },
+              "-prestress_pressure: -tissue " + std::string(law.name()) +
+                  " with the parameters of some part of the lung does not take that pressure from rest by uniform "
+                  "inflation; give a lower pressure, or that part other parameters"});
+    c.residual("-p_tp cof F : Grad eta", displacement, f1(volume_residual<P, K::follower>));
+    c.jacobian("-p_tp d(cof F)/dF", displacement, displacement, g3(volume_jacobian<P, K::follower_by_displacement>));
+    c.energy(Energy::external, "pleural_pressure", "", energy_density<P, K::work>);
+    c.energy(Energy::numerical, "numerical_dissipation", "", energy_density<P, K::numerical>);
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+private:
+  static constexpr PetscReal nearly_neutral = 0.25;
+
+  /// dp/dJ, kPa.
+  static PetscReal slope(const FreeInflation &free, PetscReal J)
+  {
+    constexpr PetscReal step = 1e-5;
+    return (free.pressure(J * (1 + step)) - free.pressure(J * (1 - step))) / (2 * step * J);
+  }
+
+  bool on_ = false;
+  PetscReal pressure_ = 5;
+  std::string method_ = "stretch";
+  PrestressKernels::Parameters parameters_;
+};
+
+} // namespace pulmo
