@@ -7,6 +7,7 @@
 #include "pulmo/physics/effects/lumen_pressure.hpp"
 #include "pulmo/physics/effects/pressure_damping.hpp"
 #include "pulmo/physics/effects/prestress.hpp"
+#include "pulmo/physics/effects/recruitment.hpp"
 #include "pulmo/physics/effects/support.hpp"
 #include "pulmo/physics/effects/traction.hpp"
 #include "pulmo/physics/effects/tube.hpp"
@@ -37,6 +38,7 @@ Registry Registry::standard()
   r.effect<LumenPressure>();
   r.effect<PressureDamping>();
   r.effect<Prestress>();
+  r.effect<Recruitment>();
   r.effect<Support>();
   r.effect<Traction>();
   r.effect<Tube>();

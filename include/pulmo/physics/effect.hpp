@@ -428,6 +428,7 @@ struct SceneFacts {
   Elements elements;
   const TissueLaw *law = nullptr;                ///< of the tissue
   std::vector<StressFreeFunction> stress_free;   ///< where it is free of stress, if not in the shape of the mesh
+  StressByPressure stress_by_pressure = nullptr; ///< how its stress depends on the gas pressure, if it does
   bool airflow = false;                          ///< the pressure field exists
   bool porosity = false;                         ///< a kernel or an observer reads the tissue's porosity (Porosity)
   const PermeabilityLaw *permeability = nullptr; ///< that the gas flows by; null without airflow

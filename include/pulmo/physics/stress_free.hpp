@@ -20,6 +20,9 @@ enum class When {
 /// Multiplies @p G, which begins as the identity, by the share of an effect.
 using StressFreeFunction = void (*)(const Point &point, const PetscScalar constants[], When when, PetscScalar G[9]);
 
+/// Adds dP'/dp, by which the tissue's stress depends on the gas pressure at a point, to @p to.
+using StressByPressure = void (*)(const Point &point, const PetscScalar constants[], PetscScalar to[9]);
+
 /// The functions of all effects, as constants of PetscDS.
 struct StressFree {
   static constexpr const char *owner = "stress_free";

@@ -284,18 +284,24 @@ struct StrainedKernels {
     Kernels::tangent(bare_point(felt.state), k.own, A);
     felt.add_tangent(A, g3);
   }
-  /// The stress-free shape at the start of the step is told by what @p now remembers.
+  // the stress-free shape at the start of the step is told by what @p now remembers
   static PetscScalar stored(const Point &now, const Point &before, const Parameters &k)
   {
     const FeltState end(now, now.state, k.other, When::now), start(now, before.state, k.other, When::accepted);
     return Kernels::energy(end.state, k.own) / end.det - Kernels::energy(start.state, k.own) / start.det;
+  }
+  /// Energy that the tissue gives up in a step as its stress-free shape changes, at the strain of its end.
+  static PetscScalar released(const Point &now, const Point &, const Parameters &k)
+  {
+    const FeltState end(now, now.state, k.other, When::now), start(now, now.state, k.other, When::accepted);
+    return Kernels::energy(start.state, k.own) / start.det - Kernels::energy(end.state, k.own) / end.det;
   }
   static PetscScalar numerical(const Point &now, const Point &before, const Parameters &k)
   {
     PetscScalar P[9] = {0}, D[9];
     stress(now, k, P);
     for (int i = 0; i < 9; ++i) D[i] = now.state.H[i] - before.state.H[i];
-    return contract(P, D) - stored(now, before, k);
+    return contract(P, D) - stored(now, before, k) - released(now, before, k);
   }
 };
 
@@ -313,6 +319,7 @@ struct LawCallbacks {
   Callback<PetscPointFunc> stress;
   Callback<PetscPointJac> tangent;
   Callback<EnergyDensity> stored, numerical;
+  Callback<EnergyDensity> released; ///< for an effect whose stress-free shape changes; null if that is the mesh's
 };
 
 /// A tissue law chosen at run time: its options, its parameters and its kernels.
@@ -372,7 +379,11 @@ public:
   }
   LawCallbacks callbacks(bool strained) const override
   {
-    return strained ? callbacks_of<StrainedKernels<Law>>() : callbacks_of<Kernels>();
+    using Strained = StrainedKernels<Law>;
+    if (!strained) return callbacks_of<Kernels>();
+    LawCallbacks callbacks = callbacks_of<Strained>();
+    callbacks.released = energy_density<typename Strained::Parameters, Strained::released>;
+    return callbacks;
   }
   LawFunctions functions(bool strained) const override
   {
@@ -423,8 +434,11 @@ private:
   static LawCallbacks callbacks_of()
   {
     using P = typename K::Parameters;
-    return {volume_residual<P, K::stress>, volume_jacobian<P, K::tangent>, energy_density<P, K::stored>,
-            energy_density<P, K::numerical>};
+    return {volume_residual<P, K::stress>,
+            volume_jacobian<P, K::tangent>,
+            energy_density<P, K::stored>,
+            energy_density<P, K::numerical>,
+            {}};
   }
   template <class K>
   static LawFunctions functions_of()

@@ -27,6 +27,7 @@ struct ViscoelasticKernels {
     PetscScalar g[max_branches] = {0};   ///< moduli over those of the law, -
     PetscScalar tau[max_branches] = {0}; ///< s
     PetscScalar stress = 0, tangent = 0; ///< LawFunctions, as constants::to_scalar() packs them
+    PetscScalar by_pressure = 0;         ///< StressByPressure, packed alike
   };
 
   /// What is remembered: S_e, then h_1, h_2, ...
@@ -87,6 +88,14 @@ struct ViscoelasticKernels {
     for (int i = 0; i < 3; ++i)
       for (int J = 0; J < 3; ++J)
         for (int L = 0; L < 3; ++L) g3[30 * i + 6 * i + 3 * J + L] += s.sum[place(L, J)] - s.c * s.S_e[place(L, J)];
+  }
+  /// g2 of (displacement, pressure) where P_e depends on the pressure: c dP_e/dp.
+  static void stress_by_pressure(const Point &point, const Parameters &k, PetscScalar g2[])
+  {
+    PetscScalar P[9] = {0};
+    constants::to_pointer<StressByPressure>(k.by_pressure)(point, point.constants, P);
+    const PetscScalar c = overstress(point, k).c;
+    for (int i = 0; i < 9; ++i) g2[i] += c * P[i];
   }
   static void remember(const Point &point, const Parameters &k, PetscScalar value[])
   {
@@ -172,6 +181,10 @@ public:
     c.remember(quantities, remembered<P, K::remember>);
     c.residual("F sum h : Grad eta", displacement, f1(volume_residual<P, K::stress>));
     c.jacobian("overstress", displacement, displacement, g3(volume_jacobian<P, K::stress_by_displacement>));
+    if (facts.airflow && facts.stress_by_pressure) {
+      parameters_.by_pressure = constants::to_scalar(facts.stress_by_pressure);
+      c.jacobian("overstress", displacement, pressure, g2(volume_jacobian<P, K::stress_by_pressure>));
+    }
     c.energy(Energy::dissipated, "viscous_tissue", "", energy_density<P, K::work>);
     PetscFunctionReturn(PETSC_SUCCESS);
   }
@@ -179,7 +192,7 @@ public:
 private:
   bool on_ = false;
   std::size_t branches_ = 3;
-  mutable ViscoelasticKernels::Parameters parameters_{0, {0.2, 0.2, 0.2}, {0.1, 1, 10}, 0, 0};
+  mutable ViscoelasticKernels::Parameters parameters_{0, {0.2, 0.2, 0.2}, {0.1, 1, 10}, 0, 0, 0};
 };
 
 } // namespace pulmo
