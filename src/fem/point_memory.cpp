@@ -172,4 +172,26 @@ void PointMemory::means(const MemorySpec &spec, std::size_t index, std::vector<P
     values[c] = measure[c] > 0 ? values[c] / measure[c] : std::numeric_limits<PetscScalar>::quiet_NaN();
 }
 
+PetscErrorCode PointMemory::integrals(std::vector<double> &values) const
+{
+  const Composition &composition = model_->composition();
+  std::vector<PetscScalar> of_cells;
+
+  PetscFunctionBeginUser;
+  values.clear();
+  for (const RememberedIntegral &integral : composition.integrals()) {
+    const auto spec = std::find_if(composition.memories().begin(), composition.memories().end(),
+                                   [&](const auto &m) { return m.effect == integral.effect && m.surface.empty(); });
+    PetscCheck(spec != composition.memories().end(), PETSC_COMM_SELF, PETSC_ERR_ARG_WRONG,
+               "%s integrates what it does not remember", integral.effect.c_str());
+    means(*spec, integral.quantity, of_cells);
+    double sum = 0;
+    for (const Sampling::Element &e : sampling_.cells()) sum += e.measure * of_cells[e.cell];
+    values.push_back(integral.factor * sum);
+  }
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, values.data(), static_cast<PetscMPIInt>(values.size()), MPI_DOUBLE, MPI_SUM,
+                             PetscObjectComm((PetscObject)model_->dm())));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 } // namespace pulmo

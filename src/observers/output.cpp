@@ -173,6 +173,8 @@ PetscErrorCode SignalWriter::observe(const StepReport &step)
         std::fprintf(file_, ",pressure_%s_cmH2O", s.name.c_str());
         if (!s.surfaces.empty()) std::fprintf(file_, ",flow_%s_ml_per_s", s.name.c_str());
       }
+      for (const RememberedIntegral &integral : integrals_)
+        if (file_) std::fprintf(file_, ",%s", integral.name.c_str());
       if (file_) std::fprintf(file_, "\n");
     }
     for (std::size_t i = first; file_ && i < step.rows.size(); ++i) {
@@ -188,6 +190,7 @@ PetscErrorCode SignalWriter::observe(const StepReport &step)
         std::fprintf(file_, ",%.15g", r.scalars[k]);
         if (!scalars_[k].surfaces.empty()) std::fprintf(file_, ",%.15g", r.scalar_flows[k]);
       }
+      for (const double integral : r.integrals) std::fprintf(file_, ",%.15g", integral);
       std::fprintf(file_, "\n");
     }
     if (file_ && (std::fflush(file_) != 0 || std::ferror(file_))) error = errno > 0 ? errno : EIO;

@@ -148,6 +148,23 @@ Json errors_json(const ErrorReport &report)
   return json;
 }
 
+/// Volume of the lung of a prestressed scene without pressure, each cell inflated back on its own, mm^3. Collective.
+PetscErrorCode unloaded_volume(const Scene &scene, const Model &model, PetscReal &volume)
+{
+  PetscInt begin, end;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMPlexGetHeightStratum(model.dm(), 0, &begin, &end));
+  volume = 0;
+  for (PetscInt c = begin; c < end; ++c) {
+    PetscReal of_cell;
+    PetscCall(DMPlexComputeCellGeometryFVM(model.dm(), c, &of_cell, nullptr, nullptr));
+    volume += of_cell * scene.facts().prestress->volume(model.constants_at(c - begin));
+  }
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &volume, 1, MPIU_REAL, MPI_SUM, PetscObjectComm((PetscObject)model.dm())));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 } // namespace
 
 std::string why_no_numbers(const Scene &scene, const std::vector<SignalRow> &rows)
@@ -173,6 +190,8 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
   std::vector<FreeBoundary> free_boundary;
   PetscCall(find_free_boundary(model.composition(), free_boundary));
   PetscCall(options.all_used(used));
+  PetscReal unloaded = 0;
+  if (scene.facts().prestress) PetscCall(unloaded_volume(scene, model, unloaded));
   const std::string file = output.path(finished ? "summary.json" : "failure.json");
   if (rank == 0) {
     Json json;
@@ -210,6 +229,12 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
     if (audits.energy) json["energy_j"] = energy_json(*audits.energy, audits.energy->rows().back());
     const bool gas = scene.facts().airflow || scene.facts().ventilator;
     json["regions"] = regions_json(audits.regions, last_breath(rows), gas);
+    if (scene.facts().prestress)
+      json["prestress"] = {
+          {"transpulmonary_pressure_cmH2O", scene.facts().prestress->pressure / units::kPa_per_cmH2O},
+          {"unloaded_volume_ml", unloaded / units::mm3_per_ml},
+          {"unloaded_volume_ratio", unloaded / scene.mesh().volume()},
+      };
     if (audits.gravity) json["gravity"] = gravity_json(*audits.gravity, last_breath(rows));
     json["functional_residual_capacity_ml"] = optional_json(frc);
     json["reference_volume_ml"] = scene.mesh().volume() / units::mm3_per_ml;

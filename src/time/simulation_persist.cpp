@@ -85,6 +85,7 @@ PetscErrorCode Simulation::persist_rows(Archive &archive)
   SignalRow empty;
   empty.scalars.assign(model_.composition().n_scalars(), 0);
   empty.scalar_flows = empty.scalars;
+  empty.integrals.assign(model_.composition().integrals().size(), 0);
   PetscCall(archive.table("signals", rows_, empty, [&](SignalRow &row, TableCells &cells) {
     std::size_t phase = archive.reading() ? 0 : phases.number(row.phase);
     cells(row.time, row.pressure, row.flow, row.volume, phase, row.breath, row.dt, row.newton, row.krylov, row.min_J,
@@ -92,6 +93,7 @@ PetscErrorCode Simulation::persist_rows(Archive &archive)
     for (double &pressure : row.scalars) cells(pressure);
     for (double &flow : row.scalar_flows) cells(flow);
     if (!row.scalars.empty()) cells(row.stored_flow);
+    for (double &integral : row.integrals) cells(integral);
     const std::string *name = phases.name(phase);
     known = known && name;
     if (archive.reading() && name) row.phase = *name;

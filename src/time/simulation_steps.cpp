@@ -418,12 +418,13 @@ PetscErrorCode Simulation::heed_signal(TSConvergedReason reason)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Simulation::report(const SignalRow &row, const Measures &measures)
+PetscErrorCode Simulation::report(SignalRow row, const Measures &measures)
 {
   const Stopwatch clock(seconds_.output);
   const PetscReal balance = measures.volume_change - delivered_;
 
   PetscFunctionBeginUser;
+  if (!model_.composition().integrals().empty()) PetscCall(model_.memory()->integrals(row.integrals));
   rows_.push_back(row);
   worst_balance_ = std::max(worst_balance_, std::abs(balance));
   min_J_ = std::min(min_J_, measures.min_J);

@@ -217,8 +217,12 @@ std::vector<Trial> trials(const Shown &o)
   std::vector<double> numbers{-1, 0, 1e-6, 1e6};
   if (range.low) numbers.insert(numbers.end(), {*range.low, *range.low - 1e-3});
   if (range.high) numbers.insert(numbers.end(), {*range.high, *range.high + 1e-3});
-  for (const double number : std::set<double>(numbers.begin(), numbers.end()))
-    list.push_back({repeated(shown(number)), !range.holds(number)});
+  for (const double number : std::set<double>(numbers.begin(), numbers.end())) {
+    std::ostringstream word; // with all its digits
+    word.precision(15);
+    word << number;
+    list.push_back({repeated(word.str()), !range.holds(number)});
+  }
   return list;
 }
 

@@ -68,6 +68,9 @@ public:
   /// over a cell's facets, and no number where a cell has none.
   void means(const MemorySpec &spec, std::size_t index, std::vector<PetscScalar> &values) const;
 
+  /// Composition::integrals() in the last accepted state. Collective.
+  PetscErrorCode integrals(std::vector<double> &values) const;
+
 private:
   PetscErrorCode add_room(const std::string &surface);
   /// Calls the effects' own functions at all points.

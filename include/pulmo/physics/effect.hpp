@@ -160,6 +160,14 @@ struct Quantity {
   std::string name, unit;
 };
 
+/// A column of the signals: an integral over the lung of what an effect remembers in the cells.
+struct RememberedIntegral {
+  std::string effect;
+  std::size_t quantity; ///< number among those of the effect
+  std::string name;     ///< with its unit
+  PetscReal factor;     ///< from mm^3 times the quantity's unit to that
+};
+
 /// What one effect remembers there.
 struct MemorySpec {
   std::string effect;
@@ -244,6 +252,13 @@ public:
   /// same owner see what is remembered. An effect that remembers on several surfaces remembers the same on each.
   void remember(std::vector<Quantity> quantities, Callback<MemoryFunction> value, const std::string &surface = "");
   const std::vector<MemorySpec> &memories() const { return memories_; }
+  /// Adds a column to the signals: the integral over the lung of quantity @p quantity of those that the effect which
+  /// speaks remembers in the cells, times @p factor.
+  void integrate(std::size_t quantity, const std::string &name, PetscReal factor)
+  {
+    integrals_.push_back({effect_, quantity, name, factor});
+  }
+  const std::vector<RememberedIntegral> &integrals() const { return integrals_; }
   /// Scalars that are remembered at a point of a cell, or of a facet of @p surface.
   PetscInt memory_width(const std::string &surface = "") const;
   /// Adds scalar unknowns and as many equations.
@@ -382,6 +397,7 @@ private:
   std::vector<DerivedParameter> derived_;
   std::vector<Reader> readers_;
   std::vector<MemorySpec> memories_;
+  std::vector<RememberedIntegral> integrals_;
   std::vector<ScalarGroup> scalar_groups_;
   std::vector<ScalarEnergyTerm> scalar_energies_;
   std::size_t n_scalars_ = 0;

@@ -20,6 +20,7 @@ struct SignalRow {
   long newton = 0, krylov = 0;
   double min_J = 1, max_J = 1;
   std::vector<double> scalars, scalar_flows; ///< of effects: cmH2O; into the lung by their surfaces, ml/s
+  std::vector<double> integrals;             ///< of what effects remember (Composition::integrals)
   double stored_flow = 0;                    ///< flow through the opening that does not enter the lung, ml/s
   bool hold = false;                         ///< the phase holds the volume (prescribed flow 0)
   std::optional<double> ventilator_pressure; ///< on the machine's side of a tube, cmH2O; without one the airway's

@@ -137,7 +137,7 @@ private:
   /// Notes an attempt that failed; ends the run if the next one would be too short.
   PetscErrorCode reject(PetscReal dt, const std::string &reason, PetscInt newton, const Measures &measures,
                         bool inverted);
-  PetscErrorCode report(const SignalRow &row, const Measures &measures);
+  PetscErrorCode report(SignalRow row, const Measures &measures);
   std::vector<Phase> phases() const;
   PetscReal landing(const Phase &phase, PetscReal end, PetscReal dt, PetscReal t) const;
   /// The same as PETSc changes it for all steps of a phase but the first (TSAdaptChoose), so that none before the end

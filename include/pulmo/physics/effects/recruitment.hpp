@@ -80,7 +80,12 @@ struct RecruitmentKernels {
   {
     stress_by_pressure(point, point.constants, g2);
   }
-  static void remember(const Point &point, const Parameters &k, PetscScalar value[]) { value[0] = open(point, k).x; }
+  /// x, and the volume that what is open takes up at the strain at hand, per volume of the mesh: J (1 - 1 / (1 + a x)).
+  static void remember(const Point &point, const Parameters &k, PetscScalar value[])
+  {
+    value[0] = open(point, k).x;
+    value[1] = point.state.J * k.gain * value[0] / (1 + k.gain * value[0]);
+  }
 };
 
 class Recruitment final : public Effect {
@@ -147,7 +152,9 @@ public:
     parameters_.tangent = constants::to_scalar(law.tangent);
     parameters_.prestress = facts.prestress ? facts.prestress->pressure : 0;
     c.parameters(parameters_);
-    c.remember({{"open_share", "1"}}, remembered<P, K::remember>);
+    c.remember({{"open_share", "1"}, {"recruited_volume", "1"}}, remembered<P, K::remember>);
+    c.integrate(0, "open_share", 1 / c.mesh().volume());
+    c.integrate(1, "recruited_volume_ml", 1 / units::mm3_per_ml);
     if (facts.airflow) c.jacobian("dP'/dp", displacement, pressure, g2(volume_jacobian<P, K::tangent_by_pressure>));
     c.energy(Energy::dissipated, "recruitment", "", facts.law->callbacks(true).released);
     PetscFunctionReturn(PETSC_SUCCESS);
