@@ -373,7 +373,7 @@ private:
   }
 
   void note_readers(const std::string &effect, const std::string &term, const std::string &surface,
-                    const std::array<const char *, 2> &owners)
+                    const Owners &owners)
   {
     for (const char *owner : owners)
       if (owner) readers_.push_back({effect, term, surface, owner});

@@ -28,7 +28,8 @@ namespace pulmo {
 /// Order of the fields that pulmo's kernels know. Displacement is always there, pressure only with airflow.
 enum FieldIndex : PetscInt { displacement = 0, pressure = 1 };
 
-/// The parameters of a kernel that reads two blocks, e.g. its own and those of the tissue: Both<Mine, Porosity>.
+/// The parameters of a kernel that reads two blocks, e.g. its own and those of the tissue: Both<Mine, Porosity>. Each
+/// of them may be two.
 template <class A, class B>
 struct Both {
   A own;
@@ -39,16 +40,23 @@ constexpr bool is_both = false;
 template <class A, class B>
 constexpr bool is_both<Both<A, B>> = true;
 
-/// The owners of what a kernel with parameters @p P reads, its own first; null: none.
+/// The owners of the blocks that a kernel reads, its own first; null: none.
+using Owners = std::array<const char *, 3>;
+/// Those of a kernel with parameters @p P.
 template <class P>
-constexpr std::array<const char *, 2> owners_of()
+constexpr Owners owners_of()
 {
-  if constexpr (is_both<P>)
-    return {owners_of<decltype(P::own)>()[0], owners_of<decltype(P::other)>()[0]};
-  else if constexpr (std::is_empty_v<P>)
-    return {};
-  else
-    return {P::owner, nullptr};
+  Owners all{};
+  if constexpr (is_both<P>) {
+    std::size_t n = 0;
+    for (const char *owner : owners_of<decltype(P::own)>())
+      if (owner) all[n++] = owner;
+    for (const char *owner : owners_of<decltype(P::other)>())
+      if (owner) all[n++] = owner; // too many are an error of the compiler's
+  } else if constexpr (!std::is_empty_v<P>) {
+    all[0] = P::owner;
+  }
+  return all;
 }
 
 /// The constants of PetscDS are a directory: [n, (tag, offset) x n, payload]. Each effect finds its own
@@ -312,7 +320,7 @@ void surface_jacobian(PULMO_POINT_ARGUMENTS, PetscReal shift, const PetscReal x[
 template <class F>
 struct Callback {
   F function = nullptr;
-  std::array<const char *, 2> owners{};
+  Owners owners{};
 };
 
 // The callback of a kernel: residual terms (f0, f1) and Jacobian terms (g0 ... g3) of the volume and of surfaces.
