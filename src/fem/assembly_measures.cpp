@@ -89,13 +89,64 @@ PetscErrorCode Assembly::measure(Vec x, Measures &measures) const
   measures.min_J_points = -extremes[1];
   measures.min_J = winner.value;
   measures.rank = winner.rank;
-  measures.cell = where;
-  if (winner.rank == least.rank && where >= 0)
+  PetscCall(share_place(where, measures));
+  if (needs_air_) PetscCall(measure_air(xs.data(), measures));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Assembly::share_place(PetscInt cell, Measures &measures) const
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)dm_);
+  PetscMPIInt rank;
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  measures.cell = cell;
+  if (measures.rank == rank && cell >= 0)
     for (int d = 0; d < 3; ++d) // reference coordinates of the centroid are -1/2
       measures.where[d] =
-          v0_[3 * where + d] + (J_[9 * where + 3 * d] + J_[9 * where + 3 * d + 1] + J_[9 * where + 3 * d + 2]) / 2;
-  PetscCallMPI(MPI_Bcast(measures.where, 3, MPIU_REAL, winner.rank, comm));
-  PetscCallMPI(MPI_Bcast(&measures.cell, 1, MPIU_INT, winner.rank, comm));
+          v0_[3 * cell + d] + (J_[9 * cell + 3 * d] + J_[9 * cell + 3 * d + 1] + J_[9 * cell + 3 * d + 2]) / 2;
+  PetscCallMPI(MPI_Bcast(measures.where, 3, MPIU_REAL, measures.rank, comm));
+  PetscCallMPI(MPI_Bcast(&measures.cell, 1, MPIU_INT, measures.rank, comm));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Assembly::measure_air(const PetscScalar *x, Measures &measures) const
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)dm_);
+  const auto n_rule = static_cast<PetscInt>(rule_weights_.size());
+  struct {
+    double value;
+    int rank;
+  } least{PETSC_MAX_REAL, 0}, winner;
+  double at_points = PETSC_MAX_REAL;
+  PetscInt where = -1;
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Comm_rank(comm, &least.rank));
+  for (PetscInt c = 0; c < layout_.cells; ++c) {
+    const CellDisplacement u(watched_, &invJ_[9 * c], cell_dofs(c), x);
+    for (PetscInt q = 0; q < watched_points_; ++q) {
+      PetscScalar H[9];
+      u.gradient(q, H);
+      const double air = 1 + jacobian_minus_one(H) - airless_J_[c]; // J that is not a number is told by min_J
+      if (q < n_rule) at_points = std::min(at_points, air);
+      if (air < least.value) {
+        least.value = air;
+        where = c;
+      }
+    }
+  }
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &at_points, 1, MPI_DOUBLE, MPI_MIN, comm));
+  PetscCallMPI(MPI_Allreduce(&least, &winner, 1, MPI_DOUBLE_INT, MPI_MINLOC, comm));
+  measures.min_air = winner.value;
+  measures.min_air_points = at_points;
+  measures.airless_J = where >= 0 ? airless_J_[where] : 0;
+  PetscCallMPI(MPI_Bcast(&measures.airless_J, 1, MPIU_REAL, winner.rank, comm));
+  if (measures.airless()) {
+    measures.rank = winner.rank;
+    PetscCall(share_place(where, measures));
+  }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

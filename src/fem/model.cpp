@@ -49,6 +49,12 @@ PetscErrorCode Model::build(Composition composition, PetscReal modulus)
   PetscCall(assembly_.setup(dm_, rate_ds, this->composition().varying()));
   row_scale_.assign(this->composition().fields().size(), 1);
   PetscCall(set_step(1, 0));
+  if (this->composition().needs_air()) {
+    std::vector<PetscReal> airless_J;
+    for (PetscInt c = 0; c < assembly_.cells(); ++c)
+      airless_J.push_back(constants::get<Porosity>(constants_at(c)).least_J());
+    assembly_.need_air(std::move(airless_J));
+  }
   if (this->composition().memories().empty()) PetscFunctionReturn(PETSC_SUCCESS);
   memory_ = std::make_unique<PointMemory>();
   PetscCall(memory_->setup(*this));

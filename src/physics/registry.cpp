@@ -12,6 +12,11 @@
 #include "pulmo/physics/effects/traction.hpp"
 #include "pulmo/physics/effects/tube.hpp"
 #include "pulmo/physics/effects/viscoelastic.hpp"
+#include "pulmo/physics/permeability/constant.hpp"
+#include "pulmo/physics/permeability/exponential.hpp"
+#include "pulmo/physics/permeability/holmes_mow.hpp"
+#include "pulmo/physics/permeability/kozeny_carman.hpp"
+#include "pulmo/physics/permeability/power.hpp"
 #include "pulmo/physics/tissue/berger.hpp"
 #include "pulmo/physics/tissue/birzle.hpp"
 #include "pulmo/physics/tissue/ma.hpp"
@@ -31,6 +36,10 @@ Registry Registry::standard()
   r.tissue_law<Rausch>();
   // permeability laws; the first is the default
   r.permeability_law<ConstantPermeability>();
+  r.permeability_law<PowerPermeability>();
+  r.permeability_law<KozenyCarmanPermeability>();
+  r.permeability_law<HolmesMowPermeability>();
+  r.permeability_law<ExponentialPermeability>();
   // effects beside tissue, airflow and ventilator
   r.effect<AirwayTree>();
   r.effect<ChestWall>();

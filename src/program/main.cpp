@@ -85,8 +85,7 @@ void print_list(const pulmo::Registry &registry)
     const std::string alias = law->alias();
     print("tissue", law->name() + (alias.empty() ? "" : "|" + alias), law->source());
   }
-  for (const auto &law : registry.make_permeability_laws())
-    print("permeability", law->name(), "how permeability follows deformation");
+  for (const auto &law : registry.make_permeability_laws()) print("permeability", law->name(), law->about());
   const pulmo::Scene scene(registry);
   for (const auto &effect : scene.effects()) print("effect", effect->name(), effect->about());
 }

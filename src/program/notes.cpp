@@ -3,6 +3,7 @@
 
 #include "pulmo/base/units.hpp"
 #include "pulmo/fem/free_boundary.hpp"
+#include "pulmo/fem/permeability_range.hpp"
 #include "pulmo/input/errors.hpp"
 #include "pulmo/observers/output.hpp"
 #include "pulmo/physics/effects/pressure_damping.hpp"
@@ -170,14 +171,16 @@ PetscErrorCode check_permeability(MPI_Comm comm, const Scene &scene, const Model
 {
   constexpr PetscReal most = 1e12;
   const PetscReal L = scene.mesh().length();
+  PermeabilityRange k;
 
   PetscFunctionBeginUser;
   if (!scene.facts().airflow) PetscFunctionReturn(PETSC_SUCCESS);
-  const PetscReal k = scene.airflow().permeability_at_rest(), bound = most * L * L / (model.modulus() * dt);
-  PulmoUserCheck(k <= bound, comm,
+  PetscCall(permeability_at_rest(scene.airflow().permeability(), model, k));
+  const PetscReal bound = most * L * L / (model.modulus() * dt);
+  PulmoUserCheck(k.largest <= bound, comm,
                  "-airflow_permeability %g mm^2/(kPa s) is so large that the flow is lost in rounding; give less than "
                  "%.1g: far below that there is no resistance left to speak of (or -airflow off)",
-                 (double)k, (double)bound);
+                 (double)k.largest, (double)bound);
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -221,11 +224,13 @@ PetscErrorCode warn_of_equal_order(MPI_Comm comm, const Scene &scene, const Mode
   const SceneFacts &facts = scene.facts();
   const Elements &elements = facts.elements;
   const PetscReal half_edge = scene.mesh().edge() / 2;
+  PermeabilityRange k;
 
   PetscFunctionBeginUser;
   if (warned || !facts.airflow || facts.pressure_damping || elements.displacement_degree > elements.pressure_degree)
     PetscFunctionReturn(PETSC_SUCCESS);
-  warned = scene.airflow().permeability_at_rest() * model.modulus() * dt < half_edge * half_edge;
+  PetscCall(permeability_at_rest(scene.airflow().permeability(), model, k));
+  warned = k.least * model.modulus() * dt < half_edge * half_edge;
   if (warned)
     PetscCall(
         PetscPrintf(comm,

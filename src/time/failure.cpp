@@ -454,23 +454,33 @@ std::string failure_text(const Scene &scene, const FailureFacts &facts, const Di
        << " s (phase " << facts.phase << ", airway pressure " << last.pressure << " cmH2O, volume " << last.volume
        << " ml, tissue law " << scene.tissue().law().name() << ", J from " << last.min_J << " to " << last.max_J
        << ").";
-  if (inverted)
-    text << " The tissue turned inside out: J = " << inverted->measures.min_J << " in the cell at ("
-         << inverted->measures.where[0] << ", " << inverted->measures.where[1] << ", " << inverted->measures.where[2]
-         << ") mm (cell " << inverted->measures.cell << " of rank " << inverted->measures.rank << ").";
+  if (inverted) {
+    const Measures &m = inverted->measures;
+    if (m.airless())
+      text << " There was no air left: J = " << m.min_air + m.airless_J << ", 1 - Phi0 = " << m.airless_J;
+    else
+      text << " The tissue turned inside out: J = " << m.min_J;
+    text << " in the cell at (" << m.where[0] << ", " << m.where[1] << ", " << m.where[2] << ") mm (cell " << m.cell
+         << " of rank " << m.rank << ").";
+  }
   text << " Tried";
   for (const FailedAttempt &f : facts.attempts) {
     text << (&f == &facts.attempts.front() ? " " : ", ") << "dt " << f.dt << " s (" << f.reason;
-    if (f.newton > 0) text << " after " << f.newton << " Newton steps" << (f.inverted ? ", J <= 0 on the way" : "");
+    if (f.newton > 0) text << " after " << f.newton << " Newton steps";
+    if (f.newton > 0 && f.inverted) text << (f.measures.airless() ? ", no air on the way" : ", J <= 0 on the way");
     text << ")";
   }
   text << "." << why(scene, facts, d);
   std::string first;
+  if (inverted && inverted->measures.airless())
+    first =
+        "less suction or load, the lung's own -tissue_porosity, -airflow_permeability_law constant (it goes on, with "
+        "a warning), ";
   if (facts.free_flow && scene.openings()) {
     const std::string unequal = scene.openings()->unequal_shares();
     if (!unequal.empty()) {
       text << " -ventilator_flow_split uniform shares the flow by area: " << unequal << ".";
-      first = "-ventilator_flow_split common_pressure, ";
+      first += "-ventilator_flow_split common_pressure, ";
     }
   }
   text << " What to try: " << first << what_to_try(scene, d);

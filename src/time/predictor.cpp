@@ -10,7 +10,7 @@ namespace {
 /// A secant that is shorter than this share of itself after the others were taken out of it says nothing new.
 constexpr PetscReal independent = 1e-6;
 
-/// Norm of the residual F(X); infinite where it is not defined (J <= 0).
+/// Norm of the residual F(X); infinite where it is not defined (J <= 0, no air).
 PetscErrorCode residual_norm(SNES snes, Vec X, Vec F, PetscReal &norm)
 {
   PetscFunctionBeginUser;

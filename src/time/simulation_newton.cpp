@@ -64,7 +64,7 @@ PetscErrorCode Simulation::residual(PetscReal t, Vec X, Vec Xdot, Vec F)
   bordered_ = {};
   PetscCall(scatter(t, X, Xdot));
   PetscCall(model_.measure(local_, measures));
-  if (!(measures.min_J_points > 0)) {
+  if (!(measures.min_J_points > 0 && measures.min_air_points > 0)) {
     SNES snes;
     inverted_ = true;
     inverted_measures_ = measures;

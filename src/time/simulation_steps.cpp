@@ -3,6 +3,7 @@
 
 #include "pulmo/base/stopwatch.hpp"
 #include "pulmo/base/units.hpp"
+#include "pulmo/fem/permeability_range.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -143,8 +144,10 @@ PetscErrorCode Simulation::accept_stage(PetscReal t, Vec X, PetscBool *accept)
   PetscCall(DMGlobalToLocal(model_.dm(), X, INSERT_VALUES, local_));
   PetscCall(model_.constrain(t, local_));
   PetscCall(model_.measure(local_, measures));
-  *accept = PetscBool(measures.min_J > 0);
-  if (!*accept) PetscCall(fail(dt, "converged to a state with J <= 0", 0, measures, true, true));
+  *accept = PetscBool(measures.min_J > 0 && measures.min_air > 0);
+  if (!*accept)
+    PetscCall(fail(dt, measures.airless() ? "converged to a state without air" : "converged to a state with J <= 0", 0,
+                   measures, true, true));
   if (!*accept) PetscFunctionReturn(PETSC_SUCCESS);
   Attempt attempt{t, dt, measures.volume_change, 0, 0, local_};
   PetscCall(airway_.pressure(local_, attempt.pressure));
@@ -232,19 +235,18 @@ PetscErrorCode Simulation::judge(PetscReal t, PetscReal volume, PetscReal pressu
 
 PetscErrorCode Simulation::end_unsolved(const std::string &what, const std::string &left)
 {
+  const PetscReal L = scene_.mesh().length();
+  PermeabilityRange k;
   std::string cause;
 
   PetscFunctionBeginUser;
   PetscCall(options_.loosened(cause));
-  const SceneFacts &facts = scene_.facts();
-  const PetscReal L = scene_.mesh().length(), spread = facts.airflow ? scene_.airflow().permeability_at_rest() *
-                                                                           model_.modulus() * wanted_dt_ / (L * L)
-                                                                     : 0;
+  if (scene_.facts().airflow) PetscCall(permeability_at_rest(scene_.airflow().permeability(), model_, k));
+  const PetscReal spread = k.largest * model_.modulus() * wanted_dt_ / (L * L);
   if (spread > fast_gas) {
     std::ostringstream text;
     text.precision(3);
-    text << "With the permeability of " << scene_.airflow().permeability_at_rest()
-         << " mm^2/(kPa s) gas crosses a cell in " << 1 / spread
+    text << "With the permeability of " << k.largest << " mm^2/(kPa s) gas crosses a cell in " << 1 / spread
          << " of a step, and tolerances are relative to that flow: lower -airflow_permeability, where there is no "
             "resistance left to speak of, or give -snes_rtol 1e-14. ";
     cause = text.str() + cause;

@@ -7,12 +7,17 @@
 #include "pulmo/physics/effects/lumen_pressure.hpp"
 #include "pulmo/physics/effects/traction.hpp"
 #include "pulmo/physics/effects/ventilator.hpp"
+#include "pulmo/physics/permeability/constant.hpp"
+#include "pulmo/physics/permeability/exponential.hpp"
+#include "pulmo/physics/permeability/holmes_mow.hpp"
+#include "pulmo/physics/permeability/kozeny_carman.hpp"
+#include "pulmo/physics/permeability/power.hpp"
 
 namespace pulmo::test {
 namespace {
 
 /// k(J) = k0 J^m + k1 J: a law whose derivative does not vanish.
-struct PowerPermeability {
+struct TestPermeability {
   struct Parameters {
     static constexpr const char *owner = "permeability";
     PetscScalar k0 = 0.8, m = 2.5, k1 = 0.3;
@@ -184,17 +189,17 @@ TEST(Airflow, PorosityRateDerivativeForAnyShift)
 }
 
 template <class Law>
-void expect_darcy(const Data &d, const typename Law::Parameters &k)
+void expect_darcy(const Data &d, const PermeabilityParameters<Law> &k)
 {
   using K = DarcyKernels<Law>;
-  using P = typename Law::Parameters;
+  using P = PermeabilityParameters<Law>;
   // -Q = k J F^-1 F^-T Grad p
   const Tensor inverse_F = inverse(d.F()), inverse_C = inverse_F * transposed(inverse_F);
   const double J = det(d.F());
   const auto flux = d.call<P>(K::flux, k, 3);
   for (int I = 0; I < 3; ++I) {
     double expected = 0;
-    for (int L = 0; L < 3; ++L) expected += Law::permeability(J, k).k * J * inverse_C[3 * I + L] * d.grad_p[L];
+    for (int L = 0; L < 3; ++L) expected += permeability_of<Law>(J, k).k * J * inverse_C[3 * I + L] * d.grad_p[L];
     EXPECT_NEAR(flux[I], expected, 1e-12 * (1 + std::abs(expected)));
   }
   expect_derivative<P>(d, K::flux, K::flux_by_pressure, k, 3, 3, move_grad_p, three);
@@ -210,7 +215,68 @@ TEST(Airflow, DarcyFluxWithConstantPermeability)
 
 TEST(Airflow, DarcyFluxWithPermeabilityThatFollowsJ)
 {
-  at_points([](const Data &d) { expect_darcy<PowerPermeability>(d, {}); });
+  at_points([](const Data &d) { expect_darcy<TestPermeability>(d, {}); });
+}
+
+TEST(Airflow, DarcyFluxWithEachLawOfThePorosity)
+{
+  at_points([](const Data &d) {
+    const Porosity porosity{0.83}; // below all J of at_points()
+    expect_darcy<PowerPermeability>(d, {{0.7, 1.7}, porosity});
+    expect_darcy<KozenyCarmanPermeability>(d, {{0.7}, porosity});
+    expect_darcy<HolmesMowPermeability>(d, {{0.7, 1.3, 0.6}, porosity});
+    expect_darcy<ExponentialPermeability>(d, {{0.7, 0.9}, porosity});
+  });
+}
+
+/// dk/dJ of a law at J, against differences.
+template <class Law>
+void expect_slope(double J, const PermeabilityParameters<Law> &p)
+{
+  const PermeabilityValue v = permeability_of<Law>(J, p);
+  const double slope = derivative([&](double step) { return permeability_of<Law>(J + step, p).k; }, 1e-4);
+  EXPECT_NEAR(v.dk_dJ, slope, 1e-9 * (std::abs(v.dk_dJ) + v.k)) << Law::name << ", J = " << J;
+}
+
+TEST(Permeability, LawsArePublishedFormulas)
+{
+  // Phi0 = 0.6, J = 1.5, so that a = 1.1/0.6
+  const Porosity porosity{0.6};
+  EXPECT_NEAR((permeability_of<PowerPermeability>(1.5, {{2, 2. / 3}, porosity}).k), 2.9958791, 1e-7);
+  EXPECT_NEAR((permeability_of<KozenyCarmanPermeability>(1.5, {{2}, porosity}).k), 8.2160494, 1e-7);
+  EXPECT_NEAR((permeability_of<HolmesMowPermeability>(1.5, {{2, 2, 0.4}, porosity}).k), 8.6315042, 1e-7);
+  EXPECT_NEAR((permeability_of<ExponentialPermeability>(1.5, {{2, 0.3}, porosity}).k), 2.5680508, 1e-7);
+  for (double J : {0.45, 0.9, 1.0, 1.7, 3.0}) {
+    expect_slope<PowerPermeability>(J, {{2, 2. / 3}, porosity});
+    expect_slope<KozenyCarmanPermeability>(J, {{2}, porosity});
+    expect_slope<HolmesMowPermeability>(J, {{2, 2, 0.4}, porosity});
+    expect_slope<ExponentialPermeability>(J, {{2, 0.3}, porosity});
+  }
+}
+
+/// phi^3 / (1 - phi)^2 of the Eulerian porosity, over its value at rest.
+TEST(Permeability, KozenyCarmanIsThatOfTheEulerianPorosity)
+{
+  for (double Phi0 : {0.3, 0.75, 0.99}) {
+    const auto packed = [](double phi) { return phi * phi * phi / ((1 - phi) * (1 - phi)); };
+    for (double J : {0.8, 1.0, 1.009, 1.01, 1.011, 2.0, 5.0}) { // with Phi0 = 0.99 the Lagrangian porosity is 1 at 1.01
+      const double k = permeability_of<KozenyCarmanPermeability>(J, {{3}, {Phi0}}).k;
+      EXPECT_NEAR(k, 3 * packed((J - 1 + Phi0) / J) / packed(Phi0), 1e-11 * k) << Phi0 << " " << J;
+    }
+  }
+}
+
+TEST(Permeability, WithoutExponentALawIsConstantBitForBit)
+{
+  for (double J : {0.3, 1.0, 1.01, 4.0}) {
+    const Porosity porosity{0.75};
+    for (const PermeabilityValue &v : {permeability_of<PowerPermeability>(J, {{0.7, 0}, porosity}),
+                                       permeability_of<HolmesMowPermeability>(J, {{0.7, 0, 0}, porosity}),
+                                       permeability_of<ExponentialPermeability>(J, {{0.7, 0}, porosity})}) {
+      EXPECT_EQ(v.k, 0.7);
+      EXPECT_EQ(v.dk_dJ, 0);
+    }
+  }
 }
 
 TEST(Airflow, DarcyFluxIsFrameIndifferent)
@@ -219,8 +285,8 @@ TEST(Airflow, DarcyFluxIsFrameIndifferent)
   at_points([&](const Data &d) {
     Data turned = d;
     turned.H = random_rotation(random) * d.F() - identity;
-    const auto a = d.call<PowerPermeability::Parameters>(DarcyKernels<PowerPermeability>::flux, {}, 3);
-    const auto b = turned.call<PowerPermeability::Parameters>(DarcyKernels<PowerPermeability>::flux, {}, 3);
+    const auto a = d.call<TestPermeability::Parameters>(DarcyKernels<TestPermeability>::flux, {}, 3);
+    const auto b = turned.call<TestPermeability::Parameters>(DarcyKernels<TestPermeability>::flux, {}, 3);
     for (int I = 0; I < 3; ++I) EXPECT_NEAR(a[I], b[I], 1e-12 * (1 + std::abs(a[I])));
   });
 }
@@ -281,7 +347,7 @@ TEST(ChestWall, SpringsResistTheVectorOrItsNormalPart)
 
 TEST(Airflow, AForceOnTheGasDrivesItLikeAGradient)
 {
-  using Law = PowerPermeability;
+  using Law = TestPermeability;
   using K = DarcyKernels<Law>;
   using P = Both<Law::Parameters, GasForce>;
   const P k{{}, {{0.4, -0.7, 0.25}}};

@@ -11,7 +11,7 @@ const std::string lung = "-dm_plex_filename " + source("meshes/cube_lung.msh") +
 const std::string breath =
     "-ventilator pcv -ventilator_pip 2 -ventilator_inspiration 0.2 -ventilator_expiration 0.2 "
     "-ventilator_ramp 0.1 -ts_dt 0.1 -ts_max_time 0.3 -airflow -airflow_permeability_law opening "
-    "-airflow_opening_permeability 300 -lumen_pressure off -ventilator_settle off "
+    "-airflow_permeability 300 -lumen_pressure off -ventilator_settle off "
     "-chest_wall -tissue simple ";
 
 /// What the page adds, by name.

@@ -33,17 +33,19 @@ const char *name_of(Airway airway)
   }
 }
 
-std::vector<std::string> laws(const Registry &registry)
+template <class Law>
+std::vector<std::string> names_of(const std::vector<std::unique_ptr<Law>> &laws)
 {
   std::vector<std::string> names;
-  for (const auto &law : registry.make_tissue_laws()) names.emplace_back(law->name());
+  for (const auto &law : laws) names.emplace_back(law->name());
   return names;
 }
 
 /// Laws, airways and schemes take turns from where the names tell: a new effect changes no scene of the others.
 Subject subject_of(const Registry &registry, const std::vector<std::string> &names, std::size_t turn)
 {
-  const std::vector<std::string> law = laws(registry);
+  const std::vector<std::string> law = names_of(registry.make_tissue_laws()),
+                                 permeability = names_of(registry.make_permeability_laws());
   std::string all;
   for (const std::string &name : names) all += name + " ";
   const std::size_t number = static_cast<std::size_t>(constants::tag(all)) + turn;
@@ -51,6 +53,7 @@ Subject subject_of(const Registry &registry, const std::vector<std::string> &nam
   s.registry = registry;
   s.effects = names;
   s.law = law[number % law.size()];
+  s.permeability = permeability[number % permeability.size()];
   s.airway = all_airways[number % std::size(all_airways)];
   s.scheme = number % 2 ? "bdf" : "beuler";
   return s;
@@ -74,7 +77,7 @@ std::string Subject::text() const
 {
   std::string all;
   for (const std::string &e : effects) all += (all.empty() ? "" : " + ") + e;
-  return all + " (" + law + ", " + name_of(airway) + ")";
+  return all + " (" + law + ", " + name_of(airway) + (airway == Airway::no_airflow ? "" : ", " + permeability) + ")";
 }
 
 std::string Subject::surroundings() const
@@ -82,7 +85,7 @@ std::string Subject::surroundings() const
   const std::string breath = "-ventilator_inspiration 0.2 -ventilator_expiration 0.2 -ventilator_ramp 0.1 "
                              "-ventilator_settle off ",
                     flow = "-ventilator vcv -ventilator_tidal_volume 0.01 -ventilator_flow_split ",
-                    gas = "-airflow -airflow_permeability 300 ",
+                    gas = "-airflow -airflow_permeability 300 -airflow_permeability_law " + permeability + " ",
                     holder = has(effects, "chest_wall") ? "" : "chest_wall";
   std::string s = "-dm_plex_filename " + source("meshes/cube_msh22_ascii.msh") +
                   " -mesh_scale 10 -pc_type lu -snes_rtol 1e-12 -snes_atol 1e-13 -snes_stol 0 -snes_max_it 40 "

@@ -21,7 +21,7 @@ struct Subject {
   Registry registry;
   std::vector<std::string> effects;
   Airway airway = Airway::held;
-  std::string law, scheme; ///< scheme: of the restart
+  std::string law, permeability, scheme; ///< laws by name; scheme: of the restart
 
   std::string text() const;
   /// The scene, but for the effects themselves.

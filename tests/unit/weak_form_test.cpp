@@ -357,7 +357,7 @@ TEST(WeakForm, EveryColumnOfTheJacobianWithDampedPressure)
 
 /// k(J) = k J^3: exercises dk/dJ in the assembled system.
 struct CubicPermeability {
-  static constexpr const char *name = "cubic";
+  static constexpr const char *name = "cubic", *about = "k = 0.5 J^3";
   struct Parameters {
     static constexpr const char *owner = "permeability";
     PetscScalar k = 0.5;

@@ -18,9 +18,15 @@ struct Measures {
   PetscReal volume_change = 0;    ///< int (J - 1) over the reference volume, mm^3
   PetscReal min_J = 1, max_J = 1; ///< over quadrature points and cell corners
   PetscReal min_J_points = 1;     ///< over quadrature points only
-  PetscReal where[3] = {0, 0, 0}; ///< material centroid of the cell with min_J, mm
+  PetscReal min_air = 1;          ///< least J - 1 + Phi0, where there must be air (Assembly::need_air); else 1
+  PetscReal min_air_points = 1;   ///< over quadrature points only
+  PetscReal airless_J = 0;        ///< 1 - Phi0 of the cell with min_air
+  PetscReal where[3] = {0, 0, 0}; ///< material centroid of the cell with min_J, with min_air if airless(), mm
   PetscInt cell = -1;             ///< its number on rank @p rank
   PetscMPIInt rank = 0;
+
+  /// No kernel may see the state, though it is not inside out.
+  bool airless() const { return min_J > 0 && !(min_air > 0); }
 };
 
 class ParameterFields;
@@ -66,6 +72,8 @@ public:
   /// With @p also the element matrices of the cells go there too. Collective.
   PetscErrorCode jacobian(Part part, PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[], Mat A,
                           CellMatrices *also = nullptr);
+  /// From now on the air is measured: @p airless_J is 1 - Phi0 of each cell.
+  void need_air(std::vector<PetscReal> airless_J) { airless_J_ = std::move(airless_J), needs_air_ = true; }
   /// J and its integral for the local vector @p x. Collective.
   PetscErrorCode measure(Vec x, Measures &measures) const;
   /// int cof F(x) : Grad y, the derivative of int (J - 1) in direction @p y, mm^3. Collective.
@@ -84,6 +92,10 @@ private:
   struct Facets;
 
   PetscErrorCode setup_cells();
+  /// The least air; where it is if there is none.
+  PetscErrorCode measure_air(const PetscScalar *x, Measures &measures) const;
+  /// Tells all ranks where cell @p cell of rank measures.rank is.
+  PetscErrorCode share_place(PetscInt cell, Measures &measures) const;
   PetscErrorCode setup_facets();
   PetscErrorCode setup_varying(const ParameterFields &fields);
   /// Gathers coefficients in blocks of cells, then of facets, integrates each block and scatters the results.
@@ -102,6 +114,8 @@ private:
   element::BasisTable watched_; ///< of displacement where J is watched: the quadrature points, then the corners
   PetscInt watched_points_ = 0;
   std::vector<PetscReal> rule_weights_, relative_weights_;
+  bool needs_air_ = false;
+  std::vector<PetscReal> airless_J_; ///< of each cell
   std::vector<Facets *> facets_;
   MatrixMap map_;
   PlaceData places_;

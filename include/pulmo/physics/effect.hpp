@@ -281,6 +281,9 @@ public:
     c.effect = effect_;
     constraints_.push_back(std::move(c));
   }
+  /// Kernels are not to see a state without air, J - 1 + Phi0 <= 0; they read the tissue's porosity.
+  void need_air() { needs_air_ = true; }
+  bool needs_air() const { return needs_air_; }
   /// The uniform gas pressure of a lung without airflow is an unknown in some phases.
   void solve_for_gas_pressure() { common_gas_pressure_ = true; }
   bool common_gas_pressure() const { return common_gas_pressure_; }
@@ -388,7 +391,7 @@ private:
   const Mesh &mesh_;
   Elements elements_;
   std::string effect_, pins_for_;
-  bool common_gas_pressure_ = false;
+  bool common_gas_pressure_ = false, needs_air_ = false;
   std::vector<FieldSpec> fields_;
   std::vector<Term> terms_;
   std::vector<Constraint> constraints_;

@@ -1,12 +1,26 @@
 /// @file
-/// Permeability laws of the airflow effect: k(J) in mm^2/(kPa s), spatially isotropic (k = kappa / eta).
+/// Permeability laws of the airflow effect: k in mm^2/(kPa s), spatially isotropic (k = kappa / eta), so that the flux
+/// in the deformed lung is q = -k grad p and the pull-back Q = k J F^-1 F^-T (-Grad p).
 ///
-/// A law is a struct with `name`, `Parameters` (owner "permeability"), `declare` and
-/// `Value permeability(J, Parameters)`, and one line in src/physics/registry.cpp.
+/// A law is one header in pulmo/physics/permeability/: a struct with
+///
+///   static constexpr const char *name, *about;             option value; formula and publication
+///   struct Parameters { static constexpr const char *owner = "permeability"; PetscScalar ...; };
+///   static PetscErrorCode declare(Options &, Parameters &);
+///   static PermeabilityValue permeability(PetscScalar J, const Parameters &);
+///
+/// and one line in src/physics/registry.cpp. A law of the porosity has, in place of the last,
+///
+///   static PermeabilityValue permeability(PetscScalar J, const Parameters &, const Porosity &);
+///
+/// It is never asked where no air is left, J - 1 + Phi0 <= 0: such states are refused.
 #pragma once
 
 #include "pulmo/input/options.hpp"
 #include "pulmo/physics/point.hpp"
+#include "pulmo/physics/porosity.hpp"
+
+#include <memory>
 
 namespace pulmo {
 
@@ -16,24 +30,35 @@ struct PermeabilityValue {
   PetscScalar dk_dJ; ///< mm^2/(kPa s)
 };
 
-/// k constant in the deformed configuration (the paper's choice).
-struct ConstantPermeability {
-  static constexpr const char *name = "constant";
+/// Declares -airflow_permeability: k at J = 1, of every law here.
+static inline PetscErrorCode declare_permeability(Options &options, PetscScalar &k)
+{
+  PetscFunctionBeginUser;
+  PetscCall(options.real("permeability", "mm^2/(kPa s)", Range::positive(), "permeability over viscosity at rest", k));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
 
-  struct Parameters {
-    static constexpr const char *owner = "permeability";
-    PetscScalar k = 1e4; ///< mm^2/(kPa s)
-  };
+/// Whether a law depends on the porosity.
+template <class Law, class = void>
+constexpr bool reads_porosity = false;
+template <class Law>
+constexpr bool reads_porosity<
+    Law, std::void_t<decltype(Law::permeability(1., std::declval<const typename Law::Parameters &>(), Porosity{}))>> =
+    true;
 
-  static PetscErrorCode declare(Options &options, Parameters &p)
-  {
-    PetscFunctionBeginUser;
-    PetscCall(options.real("permeability", "mm^2/(kPa s)", Range::positive(), "permeability over viscosity", p.k));
-    PetscFunctionReturn(PETSC_SUCCESS);
-  }
+/// What the kernels of a law read.
+template <class Law>
+using PermeabilityParameters =
+    std::conditional_t<reads_porosity<Law>, Both<typename Law::Parameters, Porosity>, typename Law::Parameters>;
 
-  static PermeabilityValue permeability(PetscScalar, const Parameters &p) { return {p.k, 0}; }
-};
+template <class Law>
+PermeabilityValue permeability_of(PetscScalar J, const PermeabilityParameters<Law> &p)
+{
+  if constexpr (reads_porosity<Law>)
+    return Law::permeability(J, p.own, p.other);
+  else
+    return Law::permeability(J, p);
+}
 
 /// A force on the gas, kPa per mm of the deformed lung, beside -grad p. An effect that brings one adds the terms of
 /// GasForceCallbacks; airflow knows of none.
@@ -59,9 +84,12 @@ class PermeabilityLaw {
 public:
   virtual ~PermeabilityLaw() = default;
   virtual const char *name() const = 0;
+  virtual const char *about() const = 0;
+  virtual bool needs_air() const = 0; ///< it is a law of the porosity, which must be positive
   virtual PetscErrorCode declare(Options &options) = 0;
   virtual const PetscScalar *parameters(PetscInt *count) const = 0;
-  virtual PetscReal at_rest() const = 0; ///< k at J = 1, mm^2/(kPa s)
+  /// k at J = 1 with the parameters among @p constants (Model::constants_at), mm^2/(kPa s).
+  virtual PetscReal at_rest(const PetscScalar constants[]) const = 0;
   virtual Callback<PetscPointFunc> flux_callback() const = 0;
   virtual Callback<PetscPointJac> flux_by_displacement_callback() const = 0;
   virtual Callback<PetscPointJac> flux_by_pressure_callback() const = 0;
@@ -73,16 +101,21 @@ template <class Law>
 class PermeabilityLawOf final : public PermeabilityLaw {
 public:
   using Kernels = DarcyKernels<Law>;
-  using Parameters = typename Law::Parameters;
+  using Parameters = PermeabilityParameters<Law>;
 
   const char *name() const override { return Law::name; }
+  const char *about() const override { return Law::about; }
+  bool needs_air() const override { return reads_porosity<Law>; }
   PetscErrorCode declare(Options &options) override { return Law::declare(options, parameters_); }
   const PetscScalar *parameters(PetscInt *count) const override
   {
-    *count = sizeof(Parameters) / sizeof(PetscScalar);
+    *count = sizeof(parameters_) / sizeof(PetscScalar);
     return reinterpret_cast<const PetscScalar *>(&parameters_);
   }
-  PetscReal at_rest() const override { return Law::permeability(1, parameters_).k; }
+  PetscReal at_rest(const PetscScalar constants[]) const override
+  {
+    return permeability_of<Law>(1, constants::get<Parameters>(constants)).k;
+  }
   Callback<PetscPointFunc> flux_callback() const override { return volume_residual<Parameters, Kernels::flux>; }
   Callback<PetscPointJac> flux_by_displacement_callback() const override
   {
@@ -104,7 +137,7 @@ public:
   }
 
 private:
-  Parameters parameters_;
+  typename Law::Parameters parameters_;
 };
 
 } // namespace pulmo

@@ -11,6 +11,10 @@ struct Porosity {
   static constexpr const char *owner = "porosity";
   PetscScalar reference = 0.99; ///< Phi0: share of the lung's volume at rest that is air
 
+  /// Air in the pores over that at rest, (J - 1 + Phi0) / Phi0; its derivative by J is 1 / Phi0.
+  PetscScalar air(PetscScalar J) const { return (J - 1 + reference) / reference; }
+  /// J at which none is left.
+  PetscScalar least_J() const { return 1 - reference; }
   /// Eulerian porosity where the volume has changed by J.
   PetscScalar at(PetscScalar J) const { return 1 - (1 - reference) / J; }
 };

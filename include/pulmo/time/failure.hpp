@@ -18,8 +18,8 @@ struct FailedAttempt {
   PetscReal time, dt; ///< where the step began and how long it was, s
   std::string reason;
   PetscInt newton;
-  Measures measures; ///< of the last state with J <= 0, if any
-  bool inverted;
+  Measures measures; ///< of the last state that kernels may not see, if any
+  bool inverted;     ///< there was one: J <= 0, or airless
 };
 
 /// Stiffness of the tissue against the softest of all plane waves at a state: the least eigenvalue over all directions

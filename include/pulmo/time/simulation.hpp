@@ -181,7 +181,7 @@ private:
   } bordered_;                  ///< a bordered step and the residual at its start, until the search along it begins
   PetscReal start_norm_ = 0;    ///< residual of the attempt at hand before any Newton step and guess
   int extra_newton_ = 0;        ///< Newton steps of the attempt at hand for the prescribed volume alone
-  bool inverted_ = false;       ///< the attempt at hand met J <= 0
+  bool inverted_ = false;       ///< the attempt at hand met J <= 0, or no air
   bool tests_jacobian_ = false; ///< -snes_test_jacobian
   bool cut_ = false;            ///< the step at hand was cut
   bool resumed_ = false;        ///< the run goes on from what was read

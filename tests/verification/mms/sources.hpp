@@ -18,7 +18,7 @@ constexpr double spring = 0.8; ///< kPa/mm
 
 /// The permeability of the manufactured problems with its derivative by hand.
 struct RationalPermeability {
-  static constexpr const char *name = "rational";
+  static constexpr const char *name = "rational", *about = "k = k0 J^2 / (2 - J / 2)";
   struct Parameters {
     static constexpr const char *owner = "permeability";
     PetscScalar k0 = mms::k0;

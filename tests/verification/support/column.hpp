@@ -37,7 +37,7 @@ inline double J_of_stress(double stress)
 
 /// k(J) = c J / W''(J): makes dJ/dt = c d2J/dX2.
 struct DiffusivePermeability {
-  static constexpr const char *name = "diffusive";
+  static constexpr const char *name = "diffusive", *about = "k = c J / W''(J)";
   struct Parameters {
     static constexpr const char *owner = "permeability";
     PetscScalar diffusivity = 1; ///< c, mm^2/s

@@ -63,14 +63,14 @@ struct AirflowKernels {
 /// Darcy flux with permeability k(J).
 template <class Law>
 struct DarcyKernels {
-  using Parameters = typename Law::Parameters;
+  using Parameters = PermeabilityParameters<Law>;
 
   /// f1 of the mass row: -Q = k/J cof^T cof Grad p, mm/s.
   static void flux(const Point &point, const Parameters &parameters, PetscScalar f1[])
   {
     const PointState &s = point.state;
     const PetscScalar *cof = s.cof_F, *g = point.grad_p;
-    const PetscScalar k_J = Law::permeability(s.J, parameters).k / s.J;
+    const PetscScalar k_J = permeability_of<Law>(s.J, parameters).k / s.J;
     PetscScalar b[3]; // cof Grad p
     for (int i = 0; i < 3; ++i) b[i] = cof[3 * i] * g[0] + cof[3 * i + 1] * g[1] + cof[3 * i + 2] * g[2];
     for (int I = 0; I < 3; ++I) f1[I] += k_J * (cof[I] * b[0] + cof[3 + I] * b[1] + cof[6 + I] * b[2]);
@@ -88,7 +88,7 @@ struct DarcyKernels {
   {
     const PointState &s = point.state;
     const PetscScalar *cof = s.cof_F;
-    const PetscScalar k_J = Law::permeability(s.J, parameters).k / s.J;
+    const PetscScalar k_J = permeability_of<Law>(s.J, parameters).k / s.J;
     for (int I = 0; I < 3; ++I)
       for (int L = 0; L < 3; ++L)
         g3[3 * I + L] += k_J * (cof[I] * cof[L] + cof[3 + I] * cof[3 + L] + cof[6 + I] * cof[6 + L]);
@@ -98,7 +98,7 @@ struct DarcyKernels {
   {
     const PointState &s = point.state;
     const PetscScalar *cof = s.cof_F, *g = point.grad_p;
-    const PermeabilityValue v = Law::permeability(s.J, parameters);
+    const PermeabilityValue v = permeability_of<Law>(s.J, parameters);
     const PetscScalar r = 1 / s.J;
     PetscScalar C_inv[9], a[3], b[3]; // C^-1, C^-1 Grad p, F^-T Grad p
     for (int i = 0; i < 3; ++i) b[i] = r * (cof[3 * i] * g[0] + cof[3 * i + 1] * g[1] + cof[3 * i + 2] * g[2]);
@@ -119,14 +119,14 @@ struct DarcyKernels {
   static void force_flux(const Point &point, const Both<Parameters, GasForce> &p, PetscScalar f1[])
   {
     const PetscScalar *cof = point.state.cof_F, *f = p.other.value;
-    const PetscScalar k = point.step.load * Law::permeability(point.state.J, p.own).k;
+    const PetscScalar k = point.step.load * permeability_of<Law>(point.state.J, p.own).k;
     for (int I = 0; I < 3; ++I) f1[I] -= k * (cof[I] * f[0] + cof[3 + I] * f[1] + cof[6 + I] * f[2]);
   }
   /// -d(k cof_iI f_i) / dF_kL.
   static void force_flux_by_displacement(const Point &point, const Both<Parameters, GasForce> &p, PetscScalar g3[])
   {
     const PetscScalar *cof = point.state.cof_F, *f = p.other.value, load = point.step.load;
-    const PermeabilityValue v = Law::permeability(point.state.J, p.own);
+    const PermeabilityValue v = permeability_of<Law>(point.state.J, p.own);
     PetscScalar cof_by_F[81] = {0}; // [i][k][I][L]
     add_cofactor_derivative(point.state.F, load * v.k, cof_by_F);
     for (int k = 0; k < 3; ++k)
@@ -157,7 +157,7 @@ private:
       const PetscScalar f = point.step.load * p.other.value[i];
       sum += f * (J * f - share * (cof[3 * i] * g[0] + cof[3 * i + 1] * g[1] + cof[3 * i + 2] * g[2]));
     }
-    return point.step.dt * Law::permeability(J, p.own).k * sum;
+    return point.step.dt * permeability_of<Law>(J, p.own).k * sum;
   }
 };
 
@@ -172,8 +172,7 @@ public:
   bool active() const override { return on_; }
   /// Open to the ventilator; without airflow the surfaces that would be.
   const std::vector<std::string> &surfaces() const { return surfaces_; }
-  /// Permeability over viscosity of the tissue at rest, mm^2/(kPa s).
-  PetscReal permeability_at_rest() const { return laws_[chosen_]->at_rest(); }
+  const PermeabilityLaw &permeability() const { return *laws_[chosen_]; }
   /// Heat of the flow in a step, by point: quadratic in Grad p, kPa.
   Callback<EnergyDensity> dissipation() const { return laws_[chosen_]->dissipation_callback(); }
 
@@ -193,7 +192,7 @@ public:
     while (names[chosen] != wanted) ++chosen;
     chosen_ = chosen;
     for (std::size_t i = 0; i < laws_.size(); ++i) {
-      options.group(name(), "permeability law " + names[i], on_ && i == chosen,
+      options.group(name(), "permeability law " + names[i] + ", " + laws_[i]->about(), on_ && i == chosen,
                     on_ ? "-airflow_permeability_law " + names[i] : "-airflow");
       PetscCall(laws_[i]->declare(options));
     }
@@ -230,6 +229,7 @@ public:
     PetscFunctionBeginUser;
     const PetscScalar *permeability = darcy.parameters(&count);
     c.parameters("permeability", permeability, count);
+    if (darcy.needs_air()) c.need_air();
     c.residual("-J p F^-T : Grad eta", displacement, f1(volume_residual<P, K::gas_stress>));
     c.residual("dJ/dt q", pressure, f0(volume_residual<P, K::porosity_rate>));
     c.residual("-Q . Grad q", pressure, f1(darcy.flux_callback()));
