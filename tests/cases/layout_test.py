@@ -55,7 +55,7 @@ class Layout(unittest.TestCase):
         wrong = []
         for path, folder in sources():
             name = os.path.splitext(os.path.basename(path))[0]
-            if folder == "physics" and (name in KERNELS or "/tissue/" in path):
+            if folder == "physics" and (name in KERNELS or "/tissue/" in path or "/permeability/" in path):
                 wrong += [f"{path} includes {h}.hpp" for h in INCLUDE.findall(text_of(path)) if not h.startswith(allowed)]
         self.assertEqual(wrong, [])
 
