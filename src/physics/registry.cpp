@@ -20,6 +20,7 @@
 #include "pulmo/physics/tissue/berger.hpp"
 #include "pulmo/physics/tissue/birzle.hpp"
 #include "pulmo/physics/tissue/ma.hpp"
+#include "pulmo/physics/tissue/patte.hpp"
 #include "pulmo/physics/tissue/rausch.hpp"
 #include "pulmo/physics/tissue/yoshihara.hpp"
 
@@ -34,6 +35,7 @@ Registry Registry::standard()
   r.tissue_law<Ma>();
   r.tissue_law<Yoshihara>();
   r.tissue_law<Rausch>();
+  r.tissue_law<Patte>();
   // permeability laws; the first is the default
   r.permeability_law<ConstantPermeability>();
   r.permeability_law<PowerPermeability>();

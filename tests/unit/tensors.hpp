@@ -190,6 +190,11 @@ inline std::optional<double> inflation_pressure(const std::string &law, double J
     return 2 * c * t - 2 * c * std::pow(J, -2 * beta - 1);
   }
   if (law == "rausch") return 16.5 / 2 * (J - 1 / J);
+  if (law == "patte") { // not of that table: tissue/patte.hpp
+    const double beta1 = 0.2, beta2 = 0.4, alpha = 0.16, delta = 0.5;
+    return 2 * beta1 * (t - 1 / J) + 4 * beta2 * (1 / t - 1 / J) +
+           2 * alpha * delta * (J - 1 / J) * std::exp(delta * (J * J - 1)) * std::pow(J, -2 * delta);
+  }
   return {};
 }
 

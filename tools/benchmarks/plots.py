@@ -16,7 +16,7 @@ class Pyplot:
 plt = Pyplot()
 COLOURS = {"setup": "#9a9a9a", "residual": "#e0a83a", "jacobian": "#3b7d4f", "solve": "#2f6c9e", "output": "#b5403a"}
 
-LAW_COLOURS = {"berger": "#c1272d", "ma": "#e08a1e", "birzle": "#3b8f4a", "yoshihara": "#2a6fb0", "rausch": "#6a4c93"}
+LAW_COLOURS = {"berger": "#c1272d", "ma": "#e08a1e", "birzle": "#3b8f4a", "yoshihara": "#2a6fb0", "rausch": "#6a4c93", "patte": "#7a5c3a"}
 OTHERS = ["#444444", "#8c564b", "#17a2b8", "#b8860b"]  # laws that came later
 
 

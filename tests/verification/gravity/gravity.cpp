@@ -38,6 +38,9 @@ std::optional<Complex> uniaxial_energy(const std::string &law, Complex J)
     const Complex shear = I1 * std::pow(I3, -1.0 / 3) - 3.0;
     return 4.1 * shear * shear + 20.7 * shear * shear * shear + 16.5 / 4 * (I3 - 1.0 - 2.0 * std::log(J));
   }
+  if (law == "patte") // not of that table: tissue/patte.hpp
+    return 0.2 * (I1 - 3.0 - 2.0 * std::log(J)) + 0.4 * (I2 - 3.0 - 4.0 * std::log(J)) +
+           0.16 * (std::exp(0.5 * (I3 - 1.0 - 2.0 * std::log(J))) - 1.0);
   return {};
 }
 

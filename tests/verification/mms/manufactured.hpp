@@ -74,6 +74,18 @@ struct Rausch {
   }
 };
 
+struct Patte {
+  static constexpr const char *name = "patte";
+  static constexpr double gas = 0.5;
+  template <class T>
+  static T W(const T &I1, const T &I2, const T &J)
+  {
+    const double beta1 = 0.2, beta2 = 0.4, alpha = 0.16, delta = 0.5;
+    return beta1 * (I1 - 3.0 - 2.0 * log(J)) + beta2 * (I2 - 3.0 - 4.0 * log(J)) +
+           alpha * (exp(delta * (J * J - 1.0 - 2.0 * log(J))) - 1.0);
+  }
+};
+
 /// Permeability of the manufactured problems: k = k0 J^2 / (2 - J/2), mm^2/(kPa s). Any smooth law will do.
 constexpr double k0 = 4;
 template <class T>

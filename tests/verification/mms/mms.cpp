@@ -267,12 +267,12 @@ PetscErrorCode scatter_values(Vec v, double scale)
 
 template <class L>
 class Manufactured : public ::testing::Test {};
-using Laws = ::testing::Types<mms::Yoshihara, mms::Birzle, mms::Berger, mms::Ma, mms::Rausch>;
+using Laws = ::testing::Types<mms::Yoshihara, mms::Birzle, mms::Berger, mms::Ma, mms::Rausch, mms::Patte>;
 /// Runs from rest. Not rausch: its shear modulus vanishes at F = I, and Newton ends in another equilibrium of the same
 /// discrete equations (README.md).
 template <class L>
 class ManufacturedRun : public ::testing::Test {};
-using LawsWithShearModulus = ::testing::Types<mms::Yoshihara, mms::Birzle, mms::Berger, mms::Ma>;
+using LawsWithShearModulus = ::testing::Types<mms::Yoshihara, mms::Birzle, mms::Berger, mms::Ma, mms::Patte>;
 class LawNames {
 public:
   template <class L>

@@ -33,12 +33,13 @@ public:
     PetscFunctionBeginUser;
     for (const auto &law : laws_) {
       names.emplace_back(law->name());
-      names.emplace_back(law->alias());
+      if (*law->alias()) names.emplace_back(law->alias());
     }
     options.group(name(), about());
     PetscCall(options.choice("", names, "tissue law", wanted));
-    const auto found = std::find(names.begin(), names.end(), wanted);
-    chosen_ = static_cast<std::size_t>(found - names.begin()) / 2;
+    const auto found = std::find_if(laws_.begin(), laws_.end(),
+                                    [&](const auto &law) { return wanted == law->name() || wanted == law->alias(); });
+    chosen_ = static_cast<std::size_t>(found - laws_.begin());
     PetscCall(options.real("porosity", "-", {0, 1, true},
                            "reference porosity Phi0: share of the volume at rest that is air (by region: "
                            "0.99,right=0.7)",
