@@ -33,49 +33,6 @@ constexpr PetscReal rounding = 1e-8;
 /// More of the lung than this is no single place.
 constexpr PetscReal large_share = 0.1;
 
-/// Directions that are tried per quarter of a circle, and the search around the softest of them.
-constexpr int directions = 6, refinements = 30;
-
-using Direction = std::array<PetscReal, 3>;
-
-/// Least eigenvalue of a symmetric 3 x 3 matrix, by Jacobi rotations: the characteristic polynomial would lose half of
-/// the digits where two eigenvalues are the same.
-PetscReal least_eigenvalue(PetscReal S[3][3])
-{
-  constexpr int sweeps = 20;
-  for (int sweep = 0; sweep < sweeps; ++sweep)
-    for (int p = 0; p < 2; ++p)
-      for (int q = p + 1; q < 3; ++q) {
-        if (S[p][q] == 0) continue;
-        const int r = 3 - p - q;
-        const PetscReal theta = (S[q][q] - S[p][p]) / (2 * S[p][q]);
-        const PetscReal t = std::copysign(1 / (std::abs(theta) + std::hypot(theta, 1)), theta);
-        const PetscReal c = 1 / std::hypot(t, 1), s = t * c, of_p = S[r][p], of_q = S[r][q];
-        S[p][p] -= t * S[p][q];
-        S[q][q] += t * S[p][q];
-        S[p][q] = S[q][p] = 0;
-        S[r][p] = S[p][r] = c * of_p - s * of_q;
-        S[r][q] = S[q][r] = s * of_p + c * of_q;
-      }
-  return std::min({S[0][0], S[1][1], S[2][2]});
-}
-
-/// Of A_iJkL n_J n_L; @p A as TissueLaw::tangent has it, [i][k][J][L].
-PetscReal stiffness_along(const PetscScalar A[81], const Direction &n)
-{
-  PetscReal Q[3][3] = {};
-  for (int i = 0; i < 3; ++i)
-    for (int k = 0; k < 3; ++k)
-      for (int J = 0; J < 3; ++J)
-        for (int L = 0; L < 3; ++L) Q[i][k] += A[27 * i + 9 * k + 3 * J + L] * n[J] * n[L];
-  return least_eigenvalue(Q);
-}
-
-Direction direction(PetscReal polar, PetscReal azimuth)
-{
-  return {std::sin(polar) * std::cos(azimuth), std::sin(polar) * std::sin(azimuth), std::cos(polar)};
-}
-
 /// Distance of a point from a segment.
 PetscReal distance(const PetscReal x[3], const RimSegment &s)
 {
@@ -285,77 +242,6 @@ std::string what_to_try(const Scene &scene, const Diagnosis &d)
 }
 
 } // namespace
-
-AcousticStiffness acoustic_stiffness(const TissueLaw &law, const PointState &state, bool refine,
-                                     const PetscScalar *constants)
-{
-  PetscScalar A[81];
-  AcousticStiffness found;
-  PetscReal polar = 0, azimuth = 0;
-
-  law.tangent(state, constants, A);
-  const auto look = [&](PetscReal at_polar, PetscReal at_azimuth) {
-    const Direction n = direction(at_polar, at_azimuth);
-    const PetscReal stiffness = stiffness_along(A, n);
-    if (!(stiffness < found.least)) return false;
-    found.least = stiffness;
-    std::copy(n.begin(), n.end(), found.direction);
-    polar = at_polar;
-    azimuth = at_azimuth;
-    return true;
-  };
-  PetscReal step = PETSC_PI / (2 * directions); // n and -n are the same: half a sphere
-  for (int i = 0; i <= directions; ++i)
-    for (int j = 0; j < (i == 0 ? 1 : 4 * directions); ++j) look(i * step, j * step);
-  for (int i = 0; refine && i < refinements; ++i) {
-    const PetscReal p = polar, a = azimuth;
-    bool better = false;
-    for (PetscReal dp : {-step, PetscReal(0), step})
-      for (PetscReal da : {-step, PetscReal(0), step}) better = look(p + dp, a + da) || better;
-    if (!better) step /= 2;
-  }
-  return found;
-}
-
-PetscReal inflation_stiffness(const TissueLaw &law, PetscReal J, const PetscScalar *constants)
-{
-  const PetscReal stretch = std::cbrt(J);
-  PetscScalar H[9] = {0}, P[9], A[81];
-  PointState state;
-  for (int i = 0; i < 9; i += 4) H[i] = stretch - 1;
-  make_point_state(H, nullptr, state);
-  law.stress(state, constants, P);
-  law.tangent(state, constants, A);
-  PetscReal first = 0, second = 0; // derivatives of W by the stretch
-  for (int i = 0; i < 3; ++i) {
-    first += P[4 * i];
-    for (int k = 0; k < 3; ++k) second += A[27 * i + 9 * k + 3 * i + k];
-  }
-  // p = W'/(3 s^2), dJ = 3 s^2 ds
-  return (second - 2 * first / stretch) / (9 * std::pow(stretch, 4));
-}
-
-std::string unstable_at_rest(const TissueLaw &law, const PetscScalar *constants)
-{
-  const PetscScalar zero[9] = {0};
-  PetscScalar A[81];
-  PointState state;
-  std::ostringstream text;
-
-  make_point_state(zero, nullptr, state);
-  law.tangent(state, constants, A);
-  PetscReal size = 0;
-  for (const PetscScalar a : A) size = std::max(size, std::abs(a));
-  // laws are functions of invariants: at rest all directions are alike
-  const PetscReal inflation = inflation_stiffness(law, 1, constants), wave = stiffness_along(A, {1, 0, 0});
-  text.precision(3);
-  if (!(inflation > rounding * size))
-    text << "free inflation has dp/dJ = " << inflation << " kPa, so that it shrinks where gas presses from inside";
-  if (!(wave >= -rounding * size))
-    text << (text.str().empty() ? "" : "; ") << "the least stiffness against a plane wave is " << wave
-         << " kPa, so that it shears by itself";
-  return text.str();
-}
 
 PetscErrorCode check_stable_at_rest(const Options &options, const Scene &scene, const Model &model)
 {

@@ -199,6 +199,11 @@ class Tools(unittest.TestCase):
         self.assertEqual(drawn.returncode, 0, drawn.stderr)
         self.assertIn("report: NOT FINISHED: at work, stopped or killed; rows up to 0.2", drawn.stdout)
 
+    def test_ranges_of_laws_are_those_of_the_page(self):
+        run = subprocess.run([os.path.join(pulmo.SOURCE, "tools/law_ranges"), "--check", "--build", os.path.dirname(pulmo.PROGRAM)],
+                             capture_output=True, text=True, timeout=60, check=False)
+        self.assertEqual(run.returncode, 0, run.stderr)
+
     def test_benchmark_compares_integrators(self):
         """Both integrators give the same residual and Jacobian; only then are times worth comparing."""
         program = os.path.join(os.path.dirname(pulmo.PROGRAM), "pulmo_assembly_benchmark")

@@ -4,6 +4,7 @@
 #pragma once
 
 #include "pulmo/fem/model.hpp"
+#include "pulmo/physics/law_range.hpp"
 #include "pulmo/physics/scene.hpp"
 #include "pulmo/time/signal_row.hpp"
 
@@ -22,25 +23,6 @@ struct FailedAttempt {
   bool inverted;     ///< there was one: J <= 0, or airless
 };
 
-/// Stiffness of the tissue against the softest of all plane waves at a state: the least eigenvalue over all directions
-/// n (of the reference state) of the acoustic tensor A_iJkL n_J n_L, kPa. At zero or below the law is not elliptic
-/// there: shape or volume change by themselves. A gas pressure adds nothing to it.
-struct AcousticStiffness {
-  PetscReal least = PETSC_MAX_REAL; ///< kPa
-  PetscReal direction[3] = {0, 0, 0};
-};
-/// @p refine: search on around the softest of the directions tried.
-AcousticStiffness acoustic_stiffness(const TissueLaw &law, const PointState &state, bool refine = true,
-                                     const PetscScalar *constants = nullptr);
-
-/// dp/dJ of tissue that inflates freely, F = J^(1/3) I and p = dW/dJ, kPa: at zero or below nothing but what holds the
-/// lung from outside keeps it from going on by itself. @p constants: as in TissueLaw::stress.
-PetscReal inflation_stiffness(const TissueLaw &law, PetscReal J, const PetscScalar *constants = nullptr);
-
-/// Why tissue with these parameters is not stable at rest; empty if it is. Free inflation must take pressure, and no
-/// plane wave may grow by itself. A law's own stress at rest counts in both; no stiffness against shear at all (CM5)
-/// is allowed.
-std::string unstable_at_rest(const TissueLaw &law, const PetscScalar *constants = nullptr);
 /// Refuses a model with cells whose tissue is not stable at rest; the message names the law's options. Collective.
 PetscErrorCode check_stable_at_rest(const Options &options, const Scene &scene, const Model &model);
 
