@@ -139,7 +139,10 @@ PetscErrorCode errors(const Steady &exact, double p_in, int bricks, Errors &e)
   PetscCall(energy.setup());
   run.simulation().add(energy);
   PetscCall(run.simulation().run(finished));
-  if (!finished) PetscFunctionReturn(PETSC_SUCCESS);
+  if (!finished) {
+    PetscCall(PetscPrintf(PETSC_COMM_WORLD, "%s\n", run.simulation().failure_text().c_str()));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
   const SignalRow &row = run.simulation().rows().back();
   e.Q = std::abs(-1000 * row.flow / area / exact.Q - 1); // leaves at x1
   e.length = std::abs(1000 * row.volume / area / exact.length() - 1);
