@@ -105,6 +105,11 @@ public:
         given_.question = "version";
       else if (is_one_of(word.text, {"-list", "--list"}))
         given_.question = "list";
+    if (!given_.question.empty() && words.size() > 1) {
+      const std::string asked = "-" + given_.question;
+      given_.question.clear();
+      return asked + " stands alone: leave out what else is on the command line";
+    }
     return sequence(words, "command line", "on the command line");
   }
 

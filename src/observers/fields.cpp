@@ -195,6 +195,7 @@ PetscErrorCode FieldWriter::setup()
     PetscFunctionReturn(PETSC_SUCCESS);
   }
   for (const std::string &name : wanted) {
+    PulmoUserCheck(name != "all", comm, "option -output_fields_memory: 'all' stands alone; leave out the other names");
     const auto found =
         std::find_if(offered.begin(), offered.end(), [&](const Remembered &r) { return r.name == name; });
     PulmoUserCheck(found != offered.end(), comm,

@@ -233,8 +233,10 @@ std::string what_to_try(const Scene &scene, const Diagnosis &d)
   case Diagnosis::Kind::solver:
     break;
   }
-  return std::string(scene.facts().airway_tree ? "the sizes and resistances of -airway_tree (are their units right?), "
-                                               : "") +
+  return std::string(scene.facts().surface_pressures_by.empty()
+                         ? ""
+                         : "the sizes and resistances of -" + scene.facts().surface_pressures_by +
+                               " (are their units right?), ") +
          "another file of petsc_options/solvers, a smaller -ts_dt, a larger -snes_max_it, a slower rise or fall of "
          "pressure or flow, -snes_linesearch_type basic where volume is far stiffer than shape; -snes_monitor and "
          "-ksp_monitor "

@@ -200,15 +200,15 @@ PetscErrorCode Simulation::create_solver()
     PetscCall(SNESSetConvergenceTest(snes, newton_converged, this, nullptr));
   if (scene_.facts().unknown_opening_pressure()) {
     PulmoUserCheck(model_.airway().homeless() == 0, comm,
-                   "-airway_tree has more branches than the airway has nodes in the mesh (%d too many): refine the "
+                   "-%s has more branches than the airway has nodes in the mesh (%d too many): refine the "
                    "surfaces of -airflow_surfaces, or join branches that follow one another",
-                   (int)model_.airway().homeless());
+                   scene_.facts().surface_pressures_by.c_str(), (int)model_.airway().homeless());
     SNESLineSearch search;
     PetscBool newton;
     SNESType type;
     const SceneFacts &facts = scene_.facts();
     const bool limits = facts.ventilator->limits_pressure(),
-               split = facts.airflow && !facts.tube && !limits && !facts.airway_tree;
+               split = facts.airflow && !facts.tube && !limits && facts.surface_pressures_by.empty();
     PetscCall(PetscObjectTypeCompare((PetscObject)snes, SNESNEWTONLS, &newton));
     PetscCall(SNESGetType(snes, &type));
     PulmoUserCheck(
@@ -216,11 +216,11 @@ PetscErrorCode Simulation::create_solver()
         "option -snes_type %s does not go with %s: there the airway pressure is an unknown of its own, which "
         "needs Newton with line search; use -snes_type newtonls%s",
         type,
-        facts.airway_tree ? "-airway_tree"
-        : facts.tube      ? "-tube"
-        : limits          ? "a limit of pressure"
-        : split           ? "-ventilator_flow_split common_pressure"
-                          : "a flow into a lung with -airflow off",
+        !facts.surface_pressures_by.empty() ? ("-" + facts.surface_pressures_by).c_str()
+        : facts.tube                        ? "-tube"
+        : limits                            ? "a limit of pressure"
+        : split                             ? "-ventilator_flow_split common_pressure"
+                                            : "a flow into a lung with -airflow off",
         split ? ", or -ventilator_flow_split uniform" : "");
     for (const char *option : {"-snes_mf", "-snes_mf_operator", "-snes_fd", "-snes_fd_color"}) {
       PetscBool given = PETSC_FALSE;

@@ -352,6 +352,8 @@ def table(m):
         "memory of no effect": (good + ["-output_fields_memory", "all"], ["-output_fields_memory", "no effect of this scene remembers"]),
         "memory of another name": (good + ["-viscoelastic", "-output_fields_memory", "overstress"],
                                    ["-output_fields_memory", "'overstress'", "overstress_3_xy_kPa"]),
+        "memory of all and of one more": (good + ["-viscoelastic", "-output_fields_memory", "all,overstress_1_xx_kPa"],
+                                          ["-output_fields_memory", "'all' stands alone"]),
         "a part without its value": (good + ["-tissue_c", "0.36,lung=0.7,pleura"], ["'pleura' is no name=value"]),
         "an empty value of a part": (good + ["-tissue_c", "0.36,lung="], ["-tissue_c (lung) takes a number (kPa), not ''"]),
         "only a sign of equality": (good + ["-tissue_c", "="], ["-tissue_c", "begins with the value"]),

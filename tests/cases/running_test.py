@@ -319,6 +319,8 @@ class Sources(unittest.TestCase):
             for about in of["effect"].values():
                 self.assertIn(f"\n{about}\n", case.out)
             self.assertEqual([n for n in of["effect"] if f"\n  -{n} " not in case.out], [])
+        for flag, stray in ("-list", "laws"), ("--list", "-tissue"), ("-version", "2"):
+            self.refused(pulmo.Case([flag, stray], directory="-", cwd=self.work), f"-{flag.strip('-')} stands alone")
         self.assertNotIn("results", os.listdir(self.work))
 
 

@@ -123,15 +123,6 @@ struct EnergyTerm {
   EnergyDensity density;
 };
 
-/// What backward Euler loses between the gas and the tissue: p (dJ - cof F : dF), kPa. The ventilator pays for the
-/// whole change of volume, the tissue gets the work of its gas stress, which is linear in the step.
-static inline PetscScalar numerical_gas_loss(const Point &now, const Point &before, const NoParameters &)
-{
-  PetscScalar D[9];
-  for (int i = 0; i < 9; ++i) D[i] = now.state.H[i] - before.state.H[i];
-  return now.gas_pressure() * volume_beyond_linear(now.state.F, D);
-}
-
 /// The scalar unknowns of one effect (pulmo/physics/scalars.hpp).
 struct ScalarGroup {
   std::string effect;
@@ -458,19 +449,20 @@ struct SceneFacts {
   Settling settling;
   FlowSplit flow_split = FlowSplit::automatic;
   std::optional<AirwayResistance> tube; ///< between ventilator and airway
-  bool airway_tree = false;             ///< branches between the airway opening and the surfaces open to it
+  std::string surface_pressures_by;     ///< the effect that solves for the pressures of the open surfaces; or nothing
   bool pressure_damping = false;        ///< oscillations of the pressure are damped
 
   /// Whether some phase leaves the airway's pressure field free, with its flux prescribed.
   bool free_airway() const
   {
-    return airflow && ventilator && ventilator->prescribes_flow() && flow_split == FlowSplit::uniform && !airway_tree;
+    return airflow && ventilator && ventilator->prescribes_flow() && flow_split == FlowSplit::uniform &&
+           surface_pressures_by.empty();
   }
   /// Whether some phase has the pressure at the airway opening (without airflow: of all gas) as an unknown of its own.
   bool unknown_opening_pressure() const
   {
-    return ventilator &&
-           (airway_tree || tube || ventilator->limits_pressure() || (ventilator->prescribes_flow() && !free_airway()));
+    return ventilator && (!surface_pressures_by.empty() || tube || ventilator->limits_pressure() ||
+                          (ventilator->prescribes_flow() && !free_airway()));
   }
 };
 

@@ -12,6 +12,7 @@
 
 #include "pulmo/mesh/mesh.hpp"
 #include "pulmo/physics/effect.hpp"
+#include "pulmo/physics/numerical_gas_loss.hpp"
 
 namespace pulmo {
 

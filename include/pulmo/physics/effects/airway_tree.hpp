@@ -144,7 +144,7 @@ public:
 
   PetscErrorCode announce(SceneFacts &facts) override
   {
-    facts.airway_tree = true;
+    facts.surface_pressures_by = name();
     return PETSC_SUCCESS;
   }
 

@@ -11,6 +11,7 @@
 
 #include "pulmo/base/units.hpp"
 #include "pulmo/physics/effect.hpp"
+#include "pulmo/physics/numerical_gas_loss.hpp"
 
 namespace pulmo {
 
