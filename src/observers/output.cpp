@@ -175,6 +175,8 @@ PetscErrorCode SignalWriter::observe(const StepReport &step)
       }
       for (const RememberedIntegral &integral : integrals_)
         if (file_) std::fprintf(file_, ",%s", integral.name.c_str());
+      for (const SignalSpec &s : signals_)
+        if (file_) std::fprintf(file_, ",%s", s.name.c_str());
       if (file_) std::fprintf(file_, "\n");
     }
     for (std::size_t i = first; file_ && i < step.rows.size(); ++i) {
@@ -191,6 +193,7 @@ PetscErrorCode SignalWriter::observe(const StepReport &step)
         if (!scalars_[k].surfaces.empty()) std::fprintf(file_, ",%.15g", r.scalar_flows[k]);
       }
       for (const double integral : r.integrals) std::fprintf(file_, ",%.15g", integral);
+      for (const SignalSpec &s : signals_) std::fprintf(file_, ",%.15g", s.value(r));
       std::fprintf(file_, "\n");
     }
     if (file_ && (std::fflush(file_) != 0 || std::ferror(file_))) error = errno > 0 ? errno : EIO;

@@ -2,6 +2,7 @@
 
 #include "pulmo/physics/effects/airflow.hpp"
 #include "pulmo/physics/effects/airway_tree.hpp"
+#include "pulmo/physics/effects/breathing_effort.hpp"
 #include "pulmo/physics/effects/chest_wall.hpp"
 #include "pulmo/physics/effects/gravity.hpp"
 #include "pulmo/physics/effects/lumen_pressure.hpp"
@@ -44,6 +45,7 @@ Registry Registry::standard()
   r.permeability_law<ExponentialPermeability>();
   // effects beside tissue, airflow and ventilator
   r.effect<AirwayTree>();
+  r.effect<BreathingEffort>();
   r.effect<ChestWall>();
   r.effect<Gravity>();
   r.effect<LumenPressure>();

@@ -11,6 +11,7 @@
 #include "pulmo/physics/point.hpp"
 #include "pulmo/physics/scalars.hpp"
 #include "pulmo/physics/tissue_law.hpp"
+#include "pulmo/time/signal_row.hpp"
 
 #include <algorithm>
 #include <array>
@@ -146,6 +147,12 @@ struct ParameterBlock {
   PetscInt count;
 };
 
+/// A column that an effect adds to the signals; its name ends with its unit.
+struct SignalSpec {
+  std::string name;
+  std::function<double(const SignalRow &)> value;
+};
+
 /// A quantity that an effect remembers at the points of the cells, or of the facets of a surface.
 struct Quantity {
   std::string name, unit;
@@ -267,6 +274,12 @@ public:
     scalar_energies_.push_back({effect_, kind, account, std::move(energy)});
   }
   const std::vector<ScalarEnergyTerm> &scalar_energies() const { return scalar_energies_; }
+  /// A column of signals.csv that follows from the others, e.g. signal("muscle_pressure_cmH2O", ...).
+  void signal(const std::string &name, std::function<double(const SignalRow &)> value)
+  {
+    signals_.push_back({name, std::move(value)});
+  }
+  const std::vector<SignalSpec> &signals() const { return signals_; }
   void constrain(Constraint c)
   {
     c.effect = effect_;
@@ -394,6 +407,7 @@ private:
   std::vector<RememberedIntegral> integrals_;
   std::vector<ScalarGroup> scalar_groups_;
   std::vector<ScalarEnergyTerm> scalar_energies_;
+  std::vector<SignalSpec> signals_;
   std::size_t n_scalars_ = 0;
   std::shared_ptr<const ParameterFields> varying_;
 };

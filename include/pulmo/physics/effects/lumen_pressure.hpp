@@ -8,6 +8,7 @@
 
 #include "pulmo/mesh/mesh.hpp"
 #include "pulmo/physics/effect.hpp"
+#include "pulmo/physics/follower_pressure.hpp"
 
 #include <algorithm>
 
@@ -17,34 +18,20 @@ struct LumenPressureKernels {
   /// f0 = p cof F N.
   static void wall(const Point &point, const NoParameters &, PetscScalar f0[])
   {
-    const PetscScalar p = point.gas_pressure(), *cof = point.state.cof_F;
-    const PetscReal *N = point.normal;
-    for (int i = 0; i < 3; ++i) f0[i] += p * (cof[3 * i] * N[0] + cof[3 * i + 1] * N[1] + cof[3 * i + 2] * N[2]);
+    add_follower_pressure(point, point.gas_pressure(), f0);
   }
-  /// g1 = p d(cof F N)/dF.
   static void wall_by_displacement(const Point &point, const NoParameters &, PetscScalar g1[])
   {
-    PetscScalar g3[81] = {0};
-    const PetscReal *N = point.normal;
-    add_cofactor_derivative(point.state.F, point.gas_pressure(), g3);
-    for (int ik = 0; ik < 9; ++ik)
-      for (int L = 0; L < 3; ++L)
-        g1[3 * ik + L] += g3[9 * ik + L] * N[0] + g3[9 * ik + 3 + L] * N[1] + g3[9 * ik + 6 + L] * N[2];
+    add_follower_pressure_by_displacement(point, point.gas_pressure(), g1);
   }
   /// g0 = cof F N.
   static void wall_by_pressure(const Point &point, const NoParameters &, PetscScalar g0[])
   {
-    const PetscScalar *cof = point.state.cof_F;
-    const PetscReal *N = point.normal;
-    for (int i = 0; i < 3; ++i) g0[i] += (cof[3 * i] * N[0] + cof[3 * i + 1] * N[1] + cof[3 * i + 2] * N[2]);
+    add_follower_pressure(point, 1, g0);
   }
-  /// Work of the wall pressure on the lung in a step: -p cof F N . du, kPa mm.
-  static PetscScalar work(const Point &now, const Point &before, const NoParameters &parameters)
+  static PetscScalar work(const Point &now, const Point &before, const NoParameters &)
   {
-    PetscScalar f0[3] = {0, 0, 0}, sum = 0;
-    wall(now, parameters, f0);
-    for (int i = 0; i < 3; ++i) sum -= f0[i] * (now.u[i] - before.u[i]);
-    return sum;
+    return follower_pressure_work(now, before, now.gas_pressure());
   }
 };
 

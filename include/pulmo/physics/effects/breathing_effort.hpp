@@ -1,0 +1,205 @@
+/// @file
+/// Effect `breathing_effort`: the muscles pull the lung open. A suction p_s(t) >= 0 that follows the surface, traction
+/// +p_s J F^-T N per reference area, on the pleura by default.
+///
+/// By Piola's identity the same as a gas pressure p_s in all of the lung and on its airway wall, less p_s in the gas
+/// (with -lumen_pressure, and nothing else on the boundary that knows the pressure).
+#pragma once
+
+#include "pulmo/base/units.hpp"
+#include "pulmo/input/csv.hpp"
+#include "pulmo/mesh/mesh.hpp"
+#include "pulmo/physics/effect.hpp"
+#include "pulmo/physics/follower_pressure.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+namespace pulmo {
+
+/// The suction over time.
+struct EffortCourse {
+  PetscReal amplitude = 5, rise = 0.8, hold = 0.1, fall = 0.3, period = 4, delay = 0; ///< cmH2O, s
+  std::vector<PetscReal> times, pressures; ///< of a file, s and cmH2O: linear between, repeated; empty: pulses
+  const SceneFacts *facts = nullptr;
+
+  /// The clock starts where a phase `settle` at the start of the run ends, s.
+  PetscReal start() const
+  {
+    if (!facts || !facts->ventilator) return delay;
+    const Phase &first = facts->ventilator->phases().front();
+    return delay + (first.name == "settle" && first.breath == 0 ? first.end : 0);
+  }
+  /// cmH2O at time @p t of the run.
+  PetscReal at(PetscReal t) const
+  {
+    const PetscReal since = t - start();
+    if (since <= 0) return 0;
+    return times.empty() ? pulse(std::fmod(since, period)) : listed(std::fmod(since, times.back()));
+  }
+
+private:
+  PetscReal pulse(PetscReal s) const
+  {
+    if (s < rise) return amplitude / 2 * (1 - std::cos(PETSC_PI * s / rise));
+    if (s <= rise + hold) return amplitude;
+    const PetscReal falling = s - rise - hold;
+    return falling < fall ? amplitude / 2 * (1 + std::cos(PETSC_PI * falling / fall)) : 0;
+  }
+  PetscReal listed(PetscReal s) const
+  {
+    const auto after = std::upper_bound(times.begin() + 1, times.end() - 1, s);
+    const auto i = static_cast<std::size_t>(after - times.begin());
+    return pressures[i - 1] + (pressures[i] - pressures[i - 1]) * (s - times[i - 1]) / (times[i] - times[i - 1]);
+  }
+};
+
+struct BreathingEffortKernels {
+  struct Parameters {
+    static constexpr const char *owner = "breathing_effort";
+    PetscScalar course = 0; ///< const EffortCourse *, as constants::to_scalar() packs it
+  };
+
+  static PetscScalar suction(const Point &point, const Parameters &k)
+  {
+    return constants::to_pointer<const EffortCourse *>(k.course)->at(point.t) * units::kPa_per_cmH2O;
+  }
+  /// f0 = -p_s cof F N.
+  static void pull(const Point &point, const Parameters &k, PetscScalar f0[])
+  {
+    add_follower_pressure(point, -suction(point, k), f0);
+  }
+  static void pull_by_displacement(const Point &point, const Parameters &k, PetscScalar g1[])
+  {
+    add_follower_pressure_by_displacement(point, -suction(point, k), g1);
+  }
+  static PetscScalar work(const Point &now, const Point &before, const Parameters &k)
+  {
+    return follower_pressure_work(now, before, -suction(now, k));
+  }
+};
+
+class BreathingEffort final : public Effect {
+public:
+  const char *name() const override { return "breathing_effort"; }
+  const char *about() const override { return "suction by the muscles of breathing, which follows the surface"; }
+  std::string example() const override
+  {
+    return "-breathing_effort -breathing_effort_pressure 2 -breathing_effort_rise 0.1 -breathing_effort_hold 0.05 "
+           "-breathing_effort_fall 0.1 -breathing_effort_period 0.3";
+  }
+  bool active() const override { return on_; }
+
+  PetscErrorCode declare(Options &options) override
+  {
+    PetscFunctionBeginUser;
+    options.group(name(), about());
+    PetscCall(options.flag("", "the muscles of breathing pull on surfaces", on_));
+    options.group(name(), about(), on_, "-breathing_effort");
+    PetscCall(options.names("surfaces", "surfaces that they pull on", surfaces_));
+    PetscCall(options.text("file",
+                           "table (CSV) time_s,pressure_cmH2O, linear between its rows and repeated; instead "
+                           "of pulses",
+                           file_));
+    PetscCall(options.real("delay", "s", Range::not_negative(),
+                           "time of rest before the first effort (after a phase 'settle' at the start)",
+                           course_.delay));
+    options.group(name(), "pulses", on_ && file_.empty(), "-breathing_effort without -breathing_effort_file");
+    PetscCall(options.real("pressure", "cmH2O", Range::not_negative(), "suction while it is held", course_.amplitude));
+    PetscCall(options.real("rise", "s", Range::positive(), "time of its rise (raised cosine)", course_.rise));
+    PetscCall(options.real("hold", "s", Range::not_negative(), "time that it is held", course_.hold));
+    PetscCall(options.real("fall", "s", Range::positive(), "time of its fall (raised cosine)", course_.fall));
+    PetscCall(options.real("period", "s", Range::positive(), "from one effort to the next", course_.period));
+    if (!on_) PetscFunctionReturn(PETSC_SUCCESS);
+    if (!file_.empty()) PetscCall(read(options));
+    PulmoUserCheck(!file_.empty() || course_.rise + course_.hold + course_.fall <= course_.period, options.comm(),
+                   "-breathing_effort_period %g s is shorter than rise, hold and fall together, %g s; give a longer "
+                   "period",
+                   (double)course_.period, (double)(course_.rise + course_.hold + course_.fall));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+  PetscErrorCode check(const Options &options, const Mesh &mesh, const SceneFacts &facts) override
+  {
+    std::vector<PetscInt> pulled, open;
+    int shared = 0;
+
+    PetscFunctionBeginUser;
+    PulmoUserCheck(!surfaces_.empty(), options.comm(), "-breathing_effort needs -breathing_effort_surfaces NAME,...");
+    PetscCall(mesh.require_surfaces(surfaces_, "-breathing_effort_surfaces"));
+    for (const std::string &airway : facts.airway_surfaces) {
+      if (mesh.surfaces().count(airway) == 0) continue;
+      PetscCall(mesh.facets(airway, open));
+      std::sort(open.begin(), open.end());
+      for (const std::string &surface : surfaces_) {
+        PetscCall(mesh.facets(surface, pulled));
+        shared = std::any_of(pulled.begin(), pulled.end(),
+                             [&](PetscInt facet) { return std::binary_search(open.begin(), open.end(), facet); });
+        PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &shared, 1, MPI_INT, MPI_LOR, options.comm()));
+        PulmoUserCheck(!shared, options.comm(),
+                       "-breathing_effort_surfaces: surface '%s' has facets of the airway '%s', where no muscle pulls; "
+                       "name the surface of the lung without its airway",
+                       surface.c_str(), airway.c_str());
+      }
+    }
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+  PetscErrorCode terms(Composition &c, const SceneFacts &facts) const override
+  {
+    using K = BreathingEffortKernels;
+    using P = K::Parameters;
+
+    PetscFunctionBeginUser;
+    course_.facts = &facts;
+    parameters_.course = constants::to_scalar(static_cast<const EffortCourse *>(&course_));
+    c.parameters(parameters_);
+    for (const std::string &surface : surfaces_) {
+      c.surface_residual("-p_s cof F N . eta", surface, displacement, f0(surface_residual<P, K::pull>));
+      c.surface_jacobian("suction", surface, displacement, displacement,
+                         g1(surface_jacobian<P, K::pull_by_displacement>));
+      c.energy(Energy::external, "muscles", surface, energy_density<P, K::work>);
+    }
+    c.signal("muscle_pressure_cmH2O", [this](const SignalRow &row) { return course_.at(row.time); });
+    c.signal("transrespiratory_pressure_cmH2O",
+             [this](const SignalRow &row) { return row.pressure + course_.at(row.time); });
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+private:
+  PetscErrorCode read(Options &options)
+  {
+    Csv table;
+
+    PetscFunctionBeginUser;
+    PetscCall(Csv::read(options.comm(), "-breathing_effort_file", file_, {"time_s", "pressure_cmH2O"}, table));
+    options.note_content("-breathing_effort_file", "a table, " + table.hash());
+    PulmoUserCheck(table.rows() >= 3, options.comm(),
+                   "-breathing_effort_file %s has %d rows; at least three of time_s,pressure_cmH2O are an effort",
+                   file_.c_str(), static_cast<int>(table.rows()));
+    for (std::size_t i = 0; i < table.rows(); ++i) {
+      std::optional<PetscReal> t, p;
+      PetscCall(table.number(i, "time_s", Range::not_negative(), t));
+      PetscCall(table.number(i, "pressure_cmH2O", Range::not_negative(), p));
+      PulmoUserCheck(t && p, options.comm(), "%s: a row needs a number in time_s and one in pressure_cmH2O",
+                     table.where(i).c_str());
+      PulmoUserCheck(i == 0 ? *t == 0 : *t > course_.times.back(), options.comm(),
+                     "%s: time_s must begin with 0 and increase from row to row", table.where(i).c_str());
+      course_.times.push_back(*t);
+      course_.pressures.push_back(*p);
+    }
+    PulmoUserCheck(course_.pressures.front() == 0 && course_.pressures.back() == 0, options.comm(),
+                   "-breathing_effort_file %s: the first and the last pressure must be 0: the effort begins from rest, "
+                   "and is repeated",
+                   file_.c_str());
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+  bool on_ = false;
+  std::vector<std::string> surfaces_{"pleura"};
+  std::string file_;
+  mutable EffortCourse course_;
+  mutable BreathingEffortKernels::Parameters parameters_;
+};
+
+} // namespace pulmo
