@@ -56,6 +56,11 @@ bool Programme::limits_pressure() const
   return std::any_of(phases_.begin(), phases_.end(), [](const Phase &p) { return p.limit.has_value(); });
 }
 
+bool Programme::may_end_early() const
+{
+  return std::any_of(phases_.begin(), phases_.end(), [](const Phase &p) { return p.may_end_early(); });
+}
+
 bool Programme::breathes() const
 {
   return std::any_of(phases_.begin(), phases_.end(), [](const Phase &p) { return p.breath > 0; });
@@ -230,6 +235,14 @@ private:
     for (const PetscReal x : {value, more.from.value_or(0), more.limit.value_or(0)})
       PulmoUserCheck(std::abs(x) <= largest_value, comm_, "%s:%d: %g is beyond what a ventilator gives; check the unit",
                      file_.c_str(), line.number, (double)x);
+    PulmoUserCheck(!more.trigger || *more.trigger > 0, comm_, "%s:%d: 'trigger' must be positive", file_.c_str(),
+                   line.number);
+    PulmoUserCheck(!more.cycle || (*more.cycle > 0 && *more.cycle < 100), comm_,
+                   "%s:%d: 'cycle' is a share of the phase's highest flow, between 0 and 100 %%", file_.c_str(),
+                   line.number);
+    PulmoUserCheck(!more.trigger || !more.cycle, comm_,
+                   "%s:%d: 'trigger' begins a breath and 'cycle' ends its inspiration; a phase has one of them",
+                   file_.c_str(), line.number);
     time_ += duration;
     PulmoUserCheck(time_ <= longest_run, comm_, "%s:%d: the phases last longer than %g s; shorten '%s'", file_.c_str(),
                    line.number, (double)longest_run, w[0].c_str());
@@ -238,6 +251,9 @@ private:
                    file_.c_str(), line.number, (int)max_phases);
     Phase &added = builder_.add(w[0], breath_, duration, control, value, ramp, more.from);
     if (more.limit) added.limit = internal(Control::pressure, *more.limit);
+    if (more.trigger && hold) added.trigger_drop = internal(Control::pressure, *more.trigger);
+    if (more.trigger && !hold) added.trigger_flow = internal(Control::flow, *more.trigger);
+    if (more.cycle) added.cycle = *more.cycle / 100;
     added.dt = more.dt;
     added.where = file_ + ":" + std::to_string(line.number);
     PetscFunctionReturn(PETSC_SUCCESS);
@@ -246,10 +262,12 @@ private:
   /// What may follow the value of a phase.
   struct Words {
     std::optional<PetscReal> from, ramp, limit, dt; // cmH2O or ml/s, s, cmH2O, s
+    std::optional<PetscReal> trigger, cycle;        // ml/s (hold: cmH2O), %
     bool breath = false;
   };
 
-  /// [ramp SECONDS] [from VALUE] [limit CMH2O] [dt SECONDS] [breath] from word @p next on.
+  /// [ramp SECONDS] [from VALUE] [limit CMH2O] [trigger VALUE] [cycle PERCENT] [dt SECONDS] [breath] from word @p next
+  /// on.
   PetscErrorCode words(const Line &line, std::size_t next, Words &given) const
   {
     const auto &w = line.words;
@@ -264,16 +282,18 @@ private:
         ++next;
         continue;
       }
-      std::optional<PetscReal> *const number_of = key == "dt"              ? &given.dt
-                                                  : key == "ramp" && !hold ? &given.ramp
-                                                  : key == "from" && !hold ? &given.from
-                                                  : key == "limit" && flow ? &given.limit
-                                                                           : nullptr;
+      std::optional<PetscReal> *const number_of = key == "dt"                        ? &given.dt
+                                                  : key == "ramp" && !hold           ? &given.ramp
+                                                  : key == "from" && !hold           ? &given.from
+                                                  : key == "limit" && flow           ? &given.limit
+                                                  : key == "trigger" && !flow        ? &given.trigger
+                                                  : key == "cycle" && !hold && !flow ? &given.cycle
+                                                                                     : nullptr;
       PulmoUserCheck(number_of, comm_, "%s:%d: '%s' does not belong to a %s phase; it may have %s", file_.c_str(),
                      line.number, key.c_str(), w[2].c_str(),
-                     hold   ? "'dt' and 'breath'"
+                     hold   ? "'trigger', 'dt' and 'breath'"
                      : flow ? "'from', 'ramp', 'limit', 'dt' and 'breath'"
-                            : "'from', 'ramp', 'dt' and 'breath'");
+                            : "'from', 'ramp', 'trigger', 'cycle', 'dt' and 'breath'");
       PulmoUserCheck(next + 1 < w.size(), comm_, "%s:%d: '%s' needs a number", file_.c_str(), line.number, key.c_str());
       PetscReal x;
       PetscCall(number(line, next + 1, "'" + key + "'", x));

@@ -93,7 +93,8 @@ bool same(const Phase &a, const Phase &b)
 {
   return a.name == b.name && a.breath == b.breath && a.control == b.control && same(a.begin, b.begin) &&
          same(a.end, b.end) && same(a.from, b.from) && same(a.to, b.to) && same(a.ramp, b.ramp) &&
-         same(a.limit, b.limit) && same(a.dt, b.dt);
+         same(a.limit, b.limit) && same(a.trigger_flow, b.trigger_flow) && same(a.trigger_drop, b.trigger_drop) &&
+         same(a.cycle, b.cycle) && same(a.dt, b.dt);
 }
 
 } // namespace
@@ -302,18 +303,21 @@ PetscErrorCode Checkpoint::persist_programme(Archive &archive)
 
   PetscFunctionBeginUser;
   if (scene_.facts().ventilator) phases = scene_.facts().ventilator->phases();
+  const bool may_end_early = Programme(phases).may_end_early();
   for (const Phase &phase : phases) names += phase.name + "\n";
   PetscCall(archive.text("programme_phases", names));
   PetscCall(archive.table("programme", phases, Phase(), [&](Phase &phase, TableCells &cells) {
     int control = phase.control == Control::flow;
     cells(phase.breath, phase.begin, phase.end, control, phase.from, phase.to, phase.ramp, phase.limit, phase.dt);
+    if (may_end_early) cells(phase.trigger_flow, phase.trigger_drop, phase.cycle);
     phase.control = control ? Control::flow : Control::pressure;
   }));
   PetscCall(archive.value("time_s", time));
   if (!archive.reading()) PetscFunctionReturn(PETSC_SUCCESS);
   std::istringstream lines(names);
   for (Phase &phase : phases) std::getline(lines, phase.name);
-  PetscCall(compare_programme(phases, time));
+  // where phases may end early the times of the list are not those of the run
+  PetscCall(compare_programme(phases, may_end_early ? PETSC_MAX_REAL : time));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

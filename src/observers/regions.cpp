@@ -91,6 +91,7 @@ PetscErrorCode RegionAudit::observe(const StepReport &step)
   std::vector<RegionState> states(volumes_.size());
 
   PetscFunctionBeginUser;
+  breath_end_ = step.breath_end;
   {
     const ReadArray x(step.local);
     for (std::size_t c = 0; c < regions_of_.size(); ++c) {
@@ -150,8 +151,7 @@ std::vector<SignalRow> RegionAudit::complete(std::vector<SignalRow> rows) const
     rows[i].rest_volume = scene_.mesh().volume() / units::mm3_per_ml;
   }
   if (facts.ventilator && rows.back().breath > 0) {
-    const double end = facts.ventilator->end_of_breath(rows.back().breath);
-    rows.back().cut = rows.back().time < end * (1 - same_time);
+    if (rows.back().time < breath_end_ * (1 - same_time)) rows.back().cut = breath_end_;
   }
   return rows;
 }

@@ -110,7 +110,7 @@ PetscErrorCode print_notes(MPI_Comm comm, const Scene &scene, const std::vector<
     PetscCall(PetscPrintf(comm,
                           "pulmo: note: the run ends at t = %.6g s, within breath %d, which would end at %.6g s: that "
                           "breath has no numbers\n",
-                          end.time, end.breath, (double)scene.facts().ventilator->end_of_breath(end.breath)));
+                          end.time, end.breath, *end.cut));
   const bool driven = n.peak_pressure > n.peep || n.fall > 0; // else what changes is what came before it
   if (unsteady && driven && !unsteady->steady())
     PetscCall(PetscPrintf(comm,

@@ -21,7 +21,9 @@ void Airway::begin_phase(const Phase &phase, PetscReal volume, PetscReal first_s
   if (!phase_.from) phase_.from = ventilator_before_;
   volume_begin_ = volume + scalars_.stored(before_);
   first_step_ = first_step;
-  limited_ = limited_before_ = exceeds_ = retake_ = false;
+  limited_ = limited_before_ = exceeds_ = retake_ = over_ = false;
+  highest_flow_ = 0;
+  highest_pressure_ = ventilator_before_;
 }
 
 PetscErrorCode Airway::past(Past &past)
@@ -38,6 +40,10 @@ PetscErrorCode Airway::past(Past &past)
   PetscCall(past.visit("volume_at_phase_begin_mm3", volume_begin_));
   PetscCall(past.visit("first_step_s", first_step_));
   if (scalars_.of_effects()) PetscCall(past.visit("scalars_kPa", before_));
+  if (phase_.may_end_early()) {
+    PetscCall(past.visit("highest_flow_mm3_per_s", highest_flow_));
+    PetscCall(past.visit("highest_pressure_kPa", highest_pressure_));
+  }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -180,6 +186,11 @@ void Airway::accept(const Attempt &attempt)
   before_.front() = pressure_;
   ventilator_before_ = ventilator_pressure(attempt.flow);
   limited_before_ = limited_;
+  highest_flow_ = std::max(highest_flow_, attempt.flow);
+  highest_pressure_ = std::max(highest_pressure_, ventilator_before_);
+  over_ = (phase_.trigger_flow && attempt.flow > *phase_.trigger_flow) ||
+          (phase_.trigger_drop && ventilator_before_ < highest_pressure_ - *phase_.trigger_drop) ||
+          (phase_.cycle && attempt.flow < *phase_.cycle * highest_flow_);
 }
 
 } // namespace pulmo

@@ -47,29 +47,47 @@ PetscErrorCode Simulation::setup()
       partners_.push_back(partner.get());
       effect_partners_.push_back(std::move(partner));
     }
-  phases_ = phases();
-  end_ = phases_.back().end;
-  whole_end_ = scene_.facts().ventilator ? scene_.facts().ventilator->phases()[phases_.size() - 1].end : PETSC_MAX_REAL;
+  (void)TSGetMaxTime(ts_, &max_time_);
+  lay_out_phases();
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-std::vector<Phase> Simulation::phases() const
+void Simulation::lay_out_phases()
 {
-  PetscReal max_time = PETSC_MAX_REAL;
+  const std::ptrdiff_t at = phase_ ? phase_ - phases_.data() : 0;
   std::vector<Phase> list;
 
-  (void)TSGetMaxTime(ts_, &max_time);
   if (scene_.facts().ventilator)
     list = scene_.facts().ventilator->phases();
   else {
     Phase run;
     run.name = "run";
-    run.end = max_time < PETSC_MAX_REAL ? max_time : 1;
+    run.end = max_time_ < PETSC_MAX_REAL ? max_time_ : 1;
     list.push_back(run);
   }
-  while (list.size() > 1 && list.back().begin >= max_time) list.pop_back();
-  list.back().end = std::min(list.back().end, max_time);
-  return list;
+  for (const EndedPhase &ended : ended_) {
+    const auto index = static_cast<std::size_t>(ended.index);
+    PetscReal end = list[index].end = ended.time;
+    for (std::size_t i = index + 1; i < list.size(); ++i) {
+      list[i].end = end + (list[i].end - list[i].begin);
+      list[i].begin = end;
+      end = list[i].end;
+    }
+  }
+  plan_ = Programme(list);
+  while (list.size() > 1 && list.back().begin > max_time_ - same_time * wanted_dt_) list.pop_back();
+  whole_end_ = scene_.facts().ventilator ? list.back().end : PETSC_MAX_REAL;
+  list.back().end = std::min(list.back().end, max_time_);
+  phases_ = std::move(list);
+  end_ = phases_.back().end;
+  if (phase_) phase_ = &phases_[at];
+}
+
+/// The phase at hand ends with the step accepted last, and the next one begins.
+void Simulation::end_phase(PetscReal t)
+{
+  ended_.push_back({static_cast<PetscInt>(phase_ - phases_.data()), t});
+  lay_out_phases();
 }
 
 bool Simulation::same(PetscReal t, PetscReal other) const
@@ -148,14 +166,14 @@ PetscErrorCode Simulation::run(bool &finished)
   PetscCall(PetscTime(&begin));
   if (!resumed_) PetscCall(start());
   finished = true;
-  for (const Phase &phase : phases_) {
+  for (auto i = static_cast<std::size_t>(resumed_ ? phase_ - phases_.data() : 0); i < phases_.size(); ++i) {
     TSConvergedReason reason;
-    const bool within = resumed_ && &phase == phase_;
-    if (resumed_ && &phase < phase_) continue;
+    const Phase phase = phases_[i]; // they are laid out again where one ends early
+    const bool within = resumed_;
     resumed_ = false;
     if (within && same(accepted_.time, phase.end)) continue;
     const PetscReal asked_before = asked_dt();
-    phase_ = &phase;
+    phase_ = &phases_[i];
     if (!within) {
       if (asked_dt() != asked_before) dt_ = asked_dt();
       PetscCall(warn_of_low_limit(phase, accepted_.machine_pressure()));
@@ -167,6 +185,7 @@ PetscErrorCode Simulation::run(bool &finished)
     PetscCall(TSSetMaxTime(ts_, phase.end));
     PetscCall(TSSetTimeStep(ts_, next_dt_));
     PetscCall(scheme_.begin_solve(static_cast<PetscInt>(rows_.size()) - 1));
+    if (!within) PetscCall(TSRestartStep(ts_)); // also where a restart found the phase before at its end
     PetscCall(TSSolve(ts_, state_));
     PetscCall(TSGetConvergedReason(ts_, &reason));
     if (reason < 0 || stopped_) {

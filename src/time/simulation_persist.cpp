@@ -109,6 +109,15 @@ PetscErrorCode Simulation::persist(Archive &archive)
 
   PetscFunctionBeginUser;
   PetscCall(persist_rows(archive));
+  if (plan_.may_end_early())
+    PetscCall(archive.table("phases_ended", ended_, EndedPhase(),
+                            [](EndedPhase &row, TableCells &cells) { cells(row.index, row.time); }));
+  if (archive.reading()) {
+    for (const EndedPhase &ended : ended_)
+      PetscCall(archive.check(ended.index >= 0 && ended.index < static_cast<PetscInt>(plan_.phases().size()),
+                              "phases_ended"));
+    lay_out_phases();
+  }
   PetscCall(archive.value("phase", index));
   PetscCall(archive.value("phase_end_s", phase_end));
   PetscCall(archive.value("dt_asked_s", wanted_dt));

@@ -362,11 +362,15 @@ PetscErrorCode Simulation::after_step()
   if (scene_.facts().airflow) PetscCall(consistent_flow(flow));
   row.flow = flow / units::mm3_per_ml;
   PetscCall(VecCopy(local_, before_));
-  const bool phase_goes_on = !same(t, phase_ == &phases_.back() ? whole_end_ : phase_->end); // perhaps after a restart
-  const bool kink = (same(t, phase_->begin + phase_->ramp) || kink_) && phase_goes_on;
   const PetscReal opening_flow = airway_.opening_flow(row.flow * units::mm3_per_ml);
   const Attempt accepted{t, row.dt, measures.volume_change, pressure, opening_flow, local_};
   for (Partner *partner : partners_) partner->accept(accepted);
+  // -ts_max_time may end the phase at hand where it ends by itself
+  const auto index = static_cast<std::size_t>(phase_ - phases_.data());
+  const bool ends_early = airway_.phase_is_over() && !same(t, plan_.phases()[index].end);
+  if (ends_early) end_phase(t);
+  const bool phase_goes_on = !same(t, phase_ == &phases_.back() ? whole_end_ : phase_->end); // perhaps after a restart
+  const bool kink = (same(t, phase_->begin + phase_->ramp) || kink_) && phase_goes_on;
   row.time = t;
   row.pressure = pressure / units::kPa_per_cmH2O;
   row.ventilator_pressure = airway_.ventilator_pressure(opening_flow) / units::kPa_per_cmH2O;
@@ -397,6 +401,7 @@ PetscErrorCode Simulation::after_step()
   }
   PetscCall(report(row, measures));
   if (crawled_ == crawling_steps) PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
+  if (ends_early) PetscCall(TSSetConvergedReason(ts_, TS_CONVERGED_USER));
   if (!same(t, end_)) PetscCall(heed_signal(TS_CONVERGED_USER));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -431,7 +436,11 @@ PetscErrorCode Simulation::report(SignalRow row, const Measures &measures)
   worst_balance_ = std::max(worst_balance_, std::abs(balance));
   min_J_ = std::min(min_J_, measures.min_J);
   const bool phase_ends = phase_ && same(row.time, phase_->end);
-  const StepReport step{rows_, row, measures, balance, before_, local_residual_, end_, phase_ends, end_cuts_next()};
+  const StepReport step{rows_,      row,
+                        measures,   balance,
+                        before_,    local_residual_,
+                        end_,       plan_.end_of_breath(row.breath),
+                        phase_ends, end_cuts_next()};
   for (Observer *observer : observers_) PetscCall(observer->observe(step));
   PetscFunctionReturn(PETSC_SUCCESS);
 }

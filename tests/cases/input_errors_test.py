@@ -635,7 +635,7 @@ def table(m):
                                              ["-tissue_porosity", "99", "0 < value < 1"]),
         "an unreadable programme line by its number": (
             file_of("long.txt", b"a 1 hold\n" * 400 + b"inspiration 1 pressure 15 rampe 0.1\n"),
-            ["long.txt:401:", "'rampe'", "'from', 'ramp', 'dt' and 'breath'"]),
+            ["long.txt:401:", "'rampe'", "'from', 'ramp', 'trigger', 'cycle', 'dt' and 'breath'"]),
         "a ramp longer than its phase": (file_of("ramp.txt", b"inspiration 1 pressure 15 ramp 2\n"),
                                          ["ramp.txt:1:", "ramp 2", "duration 1"]),
         "a phase of no duration": (file_of("zero.txt", b"inspiration 0 pressure 15\n"),

@@ -342,7 +342,7 @@ TEST(CutBreath, HasNoNumbersAndGivesNone)
   auto rows = compartment(0.0125, 0.0042, 0, 3, 0, 11);
   const auto whole = overall_numbers(rows);
   while (rows.back().phase != "inspiration" || rows.back().breath != 3) rows.pop_back();
-  rows.back().cut = true;
+  rows.back().cut = rows.back().time + 1;
   const auto all = breath_rows(rows);
   ASSERT_EQ(all.size(), 3u);
   EXPECT_TRUE(all[0].complete && all[1].complete);
@@ -353,7 +353,7 @@ TEST(CutBreath, HasNoNumbersAndGivesNone)
   EXPECT_NEAR(overall_numbers(rows).tidal_volume, whole.tidal_volume, 1e-9);
   EXPECT_NEAR(overall_numbers(rows).trapped_volume, 0, 1e-9); // the cut one holds 400 ml at its end
   rows.resize(all[0].last);                                   // within the first
-  rows.back().cut = true;
+  rows.back().cut = rows.back().time + 1;
   EXPECT_EQ(last_breath(rows).first, 0u);
   EXPECT_EQ(last_breath(rows).fullest, rows.size() - 1);
   for (const ClinicalEntry &e : overall_entries(rows, 1000)) EXPECT_FALSE(e.value) << e.key;

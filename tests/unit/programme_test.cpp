@@ -311,7 +311,7 @@ TEST(ProgrammeFile, ErrorsNameFileLineAndMend)
       {"inspiration 1 pressure 5 ramp 2\n", "must lie between 0 and the duration"},
       {"inspiration 1 pressure 5 from 2\n", "'from' is the start of a ramp"},
       {"inspiration 1 pressure 5 limit 20\n", "'limit' does not belong to a pressure phase"},
-      {"pause 1 hold 5\n", "'5' does not belong to a hold phase; it may have 'dt' and 'breath'"},
+      {"pause 1 hold 5\n", "'5' does not belong to a hold phase; it may have 'trigger', 'dt' and 'breath'"},
       {"pause 1 hold ramp 0.5\n", "'ramp' does not belong to a hold phase"},
       {"inspiration 1 pressure 5 breath breath\n", "'breath' is given twice"},
       {"inspiration 1 pressure 5 dt\n", "'dt' needs a number"},

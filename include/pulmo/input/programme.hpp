@@ -27,12 +27,17 @@ struct Phase {
   PetscReal ramp = 0;             ///< s; 0: @p to holds from the first step on
   std::optional<PetscReal> limit; ///< of the ventilator's pressure in a flow phase, kPa: reached, it is held to the end
   std::optional<PetscReal> dt;    ///< step size, s; not given: -ts_dt
-  std::string where;              ///< file and line that it comes from; empty if from options
+  /// The phase ends before @p end with the first step that meets one of these.
+  std::optional<PetscReal> trigger_flow; ///< more flows into the lung than this, mm^3/s
+  std::optional<PetscReal> trigger_drop; ///< the ventilator's pressure fell so far below its highest of the phase, kPa
+  std::optional<PetscReal> cycle;        ///< the flow into the lung fell below this share of its highest of the phase
+  std::string where;                     ///< file and line that it comes from; empty if from options
 
   /// The controlled quantity at a time of this phase (from must be known if there is a ramp).
   PetscReal value(PetscReal t) const;
   /// Volume that a flow phase delivers from its begin to time @p t, mm^3.
   PetscReal delivered(PetscReal t) const;
+  bool may_end_early() const { return trigger_flow || trigger_drop || cycle; }
 };
 
 /// The phases of a run, in order and without gaps.
@@ -43,6 +48,8 @@ public:
   const std::vector<Phase> &phases() const { return phases_; }
   bool prescribes_flow() const;
   bool limits_pressure() const;
+  /// Whether some phase may end early: the phases after it begin earlier then.
+  bool may_end_early() const;
   /// Whether some phase belongs to a breath.
   bool breathes() const;
   /// When the last phase of a breath ends, s.

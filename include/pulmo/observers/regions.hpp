@@ -59,6 +59,7 @@ private:
   const Scene &scene_;
   const Model &model_;
   const Sampling &sampling_;
+  double breath_end_ = 0;              ///< of the breath at hand, s
   double air_ = 0;                     ///< ml, at rest
   std::vector<double> least_porosity_; ///< [row], where parts of the lung have porosities of their own
   std::vector<Mesh::Region> regions_;

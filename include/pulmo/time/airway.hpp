@@ -44,6 +44,8 @@ public:
   void accept(const Attempt &attempt) override;
   /// What a step needs of the phase and of the steps before it; the phase was begun.
   PetscErrorCode past(Past &past) override;
+  /// Whether the step accepted last met what ends the phase early.
+  bool phase_is_over() const { return over_; }
   /// After past() has read: takes the scalars, and puts those that have no node into a global vector.
   PetscErrorCode restore(Vec X);
 
@@ -108,16 +110,18 @@ private:
   std::vector<PetscReal> before_ = {0}; ///< scalars before the step, kPa
   Phase phase_;
   Mode mode_ = Mode::held;
-  bool limited_ = false, limited_before_ = false; ///< the limit is held now, was held in the step before
-  bool exceeds_ = false;                          ///< the attempt judged last exceeds it
-  bool retake_ = false;                           ///< the next attempt is the first one with the limit held
-  PetscReal pressure_ = 0;                        ///< at the opening now, kPa
-  PetscReal ventilator_before_ = 0;               ///< at the ventilator before the step, kPa
-  PetscReal target_ = 0;                          ///< pressure that the phase prescribes, kPa
-  PetscReal volume_begin_ = 0;                    ///< of the gas at the begin of the phase, mm^3
-  PetscReal volume_target_ = 0, volume_ = 0;      ///< of the gas: prescribed; at the last close(), mm^3
-  PetscReal past_flow_ = 0;                       ///< share of the past in the rate of that, mm^3/s
-  PetscReal first_step_ = 0;                      ///< of the phase, s
+  bool limited_ = false, limited_before_ = false;     ///< the limit is held now, was held in the step before
+  bool exceeds_ = false;                              ///< the attempt judged last exceeds it
+  bool retake_ = false;                               ///< the next attempt is the first one with the limit held
+  PetscReal pressure_ = 0;                            ///< at the opening now, kPa
+  PetscReal ventilator_before_ = 0;                   ///< at the ventilator before the step, kPa
+  PetscReal target_ = 0;                              ///< pressure that the phase prescribes, kPa
+  PetscReal volume_begin_ = 0;                        ///< of the gas at the begin of the phase, mm^3
+  PetscReal volume_target_ = 0, volume_ = 0;          ///< of the gas: prescribed; at the last close(), mm^3
+  PetscReal past_flow_ = 0;                           ///< share of the past in the rate of that, mm^3/s
+  PetscReal first_step_ = 0;                          ///< of the phase, s
+  PetscReal highest_flow_ = 0, highest_pressure_ = 0; ///< of the phase, into the lung and at the ventilator
+  bool over_ = false;                                 ///< the phase ends early
 };
 
 } // namespace pulmo

@@ -19,6 +19,7 @@ struct StepReport {
   Vec local;                    ///< state with constrained values in place
   Vec residual;                 ///< local, rows scaled; not of the row at the start
   PetscReal end;                ///< when the run ends, s
+  PetscReal breath_end;         ///< when the breath at hand is to end as things are now, s
   bool phase_ends;              ///< this row is the last of its phase
   bool end_cuts_next;           ///< the next step would be another one if the run did not end at -ts_max_time
 };

@@ -27,7 +27,7 @@ struct SignalRow {
   std::optional<double> alveolar_pressure;   ///< mean over the reference volume, cmH2O; empty without airflow
   double rest_volume = 0;                    ///< of the lung, ml; 0: not known
   bool flow_resistance = true;               ///< something resists the flow: airflow through the tissue, or a tube
-  bool cut = false;                          ///< the run ends here, before its breath does
+  std::optional<double> cut;                 ///< the run ends here, before its breath does: when that would end, s
 
   /// What a clinician reads: the pressure at the machine, cmH2O.
   double machine_pressure() const { return ventilator_pressure.value_or(pressure); }

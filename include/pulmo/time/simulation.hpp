@@ -138,7 +138,9 @@ private:
   PetscErrorCode reject(PetscReal dt, const std::string &reason, PetscInt newton, const Measures &measures,
                         bool inverted);
   PetscErrorCode report(SignalRow row, const Measures &measures);
-  std::vector<Phase> phases() const;
+  /// Lays out the phases again, those that ended early as long as they were.
+  void lay_out_phases();
+  void end_phase(PetscReal t);
   PetscReal landing(const Phase &phase, PetscReal end, PetscReal dt, PetscReal t) const;
   /// The same as PETSc changes it for all steps of a phase but the first (TSAdaptChoose), so that none before the end
   /// is a sliver.
@@ -166,11 +168,19 @@ private:
   MatHandle matrix_;
   VecHandle state_, local_, rate_, local_residual_, before_;
   std::vector<Phase> phases_;
-  std::set<std::string> low_limits_; ///< lines of the programme that were warned of
+  /// A phase that ended before its time.
+  struct EndedPhase {
+    PetscInt index = 0;
+    PetscReal time = 0; ///< s
+  };
+  std::vector<EndedPhase> ended_;
+  PetscReal max_time_ = PETSC_MAX_REAL; ///< -ts_max_time, s
+  std::set<std::string> low_limits_;    ///< lines of the programme that were warned of
   const Phase *phase_ = nullptr;
   PetscReal wanted_dt_ = 0.05, dt_ = 0.05; ///< -ts_dt; in use before any shortening to land on a time
   PetscReal next_dt_ = 0;                  ///< size of the step after the last accepted one, before any cut
   PetscReal end_ = 0, whole_end_ = 0;      ///< of the run; of its last phase but for -ts_max_time
+  Programme plan_{{}};                     ///< all phases as they are laid out now, but for -ts_max_time
   SignalRow accepted_;
   std::vector<SignalRow> rows_;
   PetscReal delivered_ = 0, worst_balance_ = 0, worst_reaction_ = 0, min_J_ = 1;
