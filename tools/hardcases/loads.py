@@ -283,3 +283,33 @@ def breaths(lab):
         # kept until the end, for summary.json and for checkpoints: a row of signals, energy and regions per step
         lab.demand("memory gained per step between them (bytes)", float(gained), f"< {ROW} (the row kept of each step) + 250",
                    gained < ROW + 250)
+
+
+@case("Efforts that flutter", "each phase ends with the first row that meets its condition, or on time; energy balance; 2 ranks do the same")
+def flutter(lab):
+    """Five efforts a second that rise and fall within a step or two, a trigger that 0.001 ml/s meets, an inspiration that ends soon: phases
+    of a few steps, each of which begins with a jump of pressure and moves all that follow."""
+    scene = pulmo.DIRECT + pulmo.SCENE + pulmo.LITRE + ["-airflow_permeability", 1e4, "-lumen_pressure", "on", "-ts_dt", 0.02,
+        "-breathing_effort", "-breathing_effort_pressure", 6, "-breathing_effort_rise", 0.03, "-breathing_effort_hold", 0.02,
+        "-breathing_effort_fall", 0.03, "-breathing_effort_period", 0.2] + pulmo.programme(
+        f"repeat {5 if lab.small else 8}\n inspiration 1 pressure 5 cycle 50\n expiration 0.5 pressure 0 trigger 0.001\nend\n")
+    run, two = lab.finished(scene, "flutters"), lab.finished(scene, "the same on 2 ranks", ranks=2)
+    if run is None or two is None:
+        return
+    rows = run.signals()
+    time, flow, names = rows["time_s"], rows["flow_ml_per_s"], rows["phase"]
+    ends = [i for i in range(1, len(names)) if i + 1 == len(names) or names[i + 1] != names[i]]
+    late = short = 0
+    for begin, end in zip([0] + ends, ends):
+        q = flow[begin + 1:end + 1]
+        met = q < 0.5 * np.maximum.accumulate(np.maximum(q, 0)) if names[end] == "inspiration" else q > 0.001
+        late += met[:-1].any()
+        longest = 1 if names[end] == "inspiration" else 0.5
+        short += not met[-1] and abs(time[end] - time[begin] - longest) > 1e-9
+    lab.above("phases", len(ends), 9)
+    lab.demand("phases that went on though their condition was met", int(late), "0", late == 0)
+    lab.demand("phases that ended without reason", int(short), "0", short == 0)
+    lab.true("2 ranks: the same phases", two.signals()["phase"] == names)
+    lab.below("2 ranks: volume beside that of one, over that at rest",
+              np.abs(two.signals()["volume_ml"] - rows["volume_ml"]).max() / run.json()["reference_volume_ml"], 1e-7)
+    lab.below("energy balance, residual over work", run.json()["energy_j"]["residual_relative"], 1e-7)
