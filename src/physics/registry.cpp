@@ -10,6 +10,7 @@
 #include "pulmo/physics/effects/prestress.hpp"
 #include "pulmo/physics/effects/recruitment.hpp"
 #include "pulmo/physics/effects/support.hpp"
+#include "pulmo/physics/effects/surfactant.hpp"
 #include "pulmo/physics/effects/traction.hpp"
 #include "pulmo/physics/effects/tube.hpp"
 #include "pulmo/physics/effects/viscoelastic.hpp"
@@ -53,6 +54,7 @@ Registry Registry::standard()
   r.effect<Prestress>();
   r.effect<Recruitment>();
   r.effect<Support>();
+  r.effect<Surfactant>();
   r.effect<Traction>();
   r.effect<Tube>();
   r.effect<Viscoelastic>();
