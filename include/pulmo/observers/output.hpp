@@ -69,7 +69,8 @@ private:
 class SignalWriter final : public Observer {
 public:
   SignalWriter(MPI_Comm comm, const Output &output, const SceneFacts &facts, const Composition &composition)
-      : comm_(comm), output_(output), facts_(facts), integrals_(composition.integrals()), signals_(composition.signals())
+      : comm_(comm), output_(output), facts_(facts), integrals_(composition.integrals()),
+        signals_(composition.signals())
   {
     for (const ScalarGroup &group : composition.scalar_groups())
       scalars_.insert(scalars_.end(), group.scalars.begin(), group.scalars.end());

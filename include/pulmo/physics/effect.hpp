@@ -458,6 +458,7 @@ struct SceneFacts {
   const PermeabilityLaw *permeability = nullptr; ///< that the gas flows by; null without airflow
   std::optional<GravityFacts> gravity;
   std::optional<PrestressFacts> prestress;
+  PetscScalar (*pleural_suction)(PetscReal t, const PetscScalar constants[]) = nullptr; ///< by muscles, kPa; or none
   std::vector<std::string> airway_surfaces;    ///< open to the ventilator; without airflow those that would be
   std::shared_ptr<const Programme> ventilator; ///< null without a ventilator
   Settling settling;

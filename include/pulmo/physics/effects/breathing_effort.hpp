@@ -60,6 +60,11 @@ struct BreathingEffortKernels {
     PetscScalar course = 0; ///< const EffortCourse *, as constants::to_scalar() packs it
   };
 
+  static PetscScalar pleural_suction(PetscReal t, const PetscScalar constants[])
+  {
+    const auto k = constants::get<Parameters>(constants);
+    return constants::to_pointer<const EffortCourse *>(k.course)->at(t) * units::kPa_per_cmH2O;
+  }
   static PetscScalar suction(const Point &point, const Parameters &k)
   {
     return constants::to_pointer<const EffortCourse *>(k.course)->at(point.t) * units::kPa_per_cmH2O;
@@ -117,6 +122,12 @@ public:
                    "period",
                    (double)course_.period, (double)(course_.rise + course_.hold + course_.fall));
     PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+  PetscErrorCode announce(SceneFacts &facts) override
+  {
+    facts.pleural_suction = BreathingEffortKernels::pleural_suction;
+    return PETSC_SUCCESS;
   }
 
   PetscErrorCode check(const Options &options, const Mesh &mesh, const SceneFacts &facts) override

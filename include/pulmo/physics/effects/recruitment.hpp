@@ -3,10 +3,11 @@
 ///
 /// Each point has an open share x in [0, 1] (after Bates & Irvin 2002):
 ///   dx/dt = s_o (p - p_o)_+ - s_c (p_c - p)_+,   0 <= x <= 1,
-/// with the local transpulmonary pressure p, that of the gas and what `prestress` adds. What is open takes up its
-/// volume without stress: the stress-free state grows by J_r = (1 + a x) / (1 + a x_0), and the energy per volume of
-/// the mesh is J_r W(F J_r^(-1/3)). Air is J - 1 + Phi0 as ever, so mass is conserved as ever. The rate is that of the
-/// time scheme, at the end of the step, and x is clipped then; where it is not, x depends on p, and so does the stress.
+/// with the local transpulmonary pressure p: that of the gas, what `prestress` adds, and the pull of the muscles. What
+/// is open takes up its volume without stress: the stress-free state grows by J_r = (1 + a x) / (1 + a x_0), and the
+/// energy per volume of the mesh is J_r W(F J_r^(-1/3)). Air is J - 1 + Phi0 as ever, so mass is conserved as ever. The
+/// rate is that of the time scheme, at the end of the step, and x is clipped then; where it is not, x depends on p, and
+/// so does the stress.
 #pragma once
 
 #include "pulmo/base/units.hpp"
@@ -24,6 +25,7 @@ struct RecruitmentKernels {
     PetscScalar gain = 0.5;              ///< a
     PetscScalar start = 0;               ///< x_0
     PetscScalar prestress = 0;           ///< transpulmonary pressure where that of the gas is 0, kPa
+    PetscScalar suction = 0;             ///< SceneFacts::pleural_suction, as constants::to_scalar() packs it
     PetscScalar stress = 0, tangent = 0; ///< LawFunctions, as constants::to_scalar() packs them
   };
 
@@ -34,7 +36,9 @@ struct RecruitmentKernels {
   static Share open(const Point &point, const Parameters &k)
   {
     if (!point.memory.last) return {k.start, 0};
-    const PetscScalar p = (point.gas_pressure() + k.prestress) / units::kPa_per_cmH2O, a = point.step.slope;
+    const auto suction = constants::to_pointer<decltype(SceneFacts::pleural_suction)>(k.suction);
+    const PetscScalar pull = k.prestress + (suction ? suction(point.t, point.constants) : 0),
+                      p = (point.gas_pressure() + pull) / units::kPa_per_cmH2O, a = point.step.slope;
     const PetscScalar rate =
         k.opening_rate * std::max(p - k.opening_pressure, 0.) - k.closing_rate * std::max(k.closing_pressure - p, 0.);
     const PetscScalar slope = p > k.opening_pressure ? k.opening_rate : p < k.closing_pressure ? k.closing_rate : 0;
@@ -150,6 +154,7 @@ public:
     const LawFunctions law = facts.law->functions(true);
     parameters_.stress = constants::to_scalar(law.stress);
     parameters_.tangent = constants::to_scalar(law.tangent);
+    parameters_.suction = constants::to_scalar(facts.pleural_suction);
     parameters_.prestress = facts.prestress ? facts.prestress->pressure : 0;
     c.parameters(parameters_);
     c.remember({{"open_share", "1"}, {"recruited_volume", "1"}}, remembered<P, K::remember>);

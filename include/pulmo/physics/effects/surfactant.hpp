@@ -29,7 +29,6 @@ struct SurfactantKernels {
     PetscScalar adsorption = 2, relaxation = 0.1;             ///< k_a, k_r, 1/s
     PetscScalar compression = 120, expansion = 140;           ///< eps_c, eps_e, mN/m
     PetscScalar area = 30;                                    ///< S0, 1/mm
-    PetscScalar in_excess = 1; ///< 1: the tissue bears the pull at rest already; 0: its stress at rest is given
   };
 
   /// What is remembered.
@@ -65,10 +64,7 @@ struct SurfactantKernels {
     return 2.0 / 3 * units::kPa_mm_per_mN_m * k.area / std::cbrt(point.state.J);
   }
   /// p_rest, kPa.
-  static PetscScalar at_rest(const Parameters &k)
-  {
-    return k.in_excess * 2.0 / 3 * units::kPa_mm_per_mN_m * k.area * k.gamma_eq;
-  }
+  static PetscScalar at_rest(const Parameters &k) { return 2.0 / 3 * units::kPa_mm_per_mN_m * k.area * k.gamma_eq; }
 
   /// f1 = (p_gamma - p_rest) cof F.
   template <bool Dynamic>
