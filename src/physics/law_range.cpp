@@ -175,12 +175,43 @@ std::string unstable_at_rest(const TissueLaw &law, const PetscScalar *constants)
   return text.str();
 }
 
-PetscReal inflation_pressure(const TissueLaw &law, PetscReal J)
+PetscReal inflation_pressure(const TissueLaw &law, PetscReal J, const PetscScalar *constants)
 {
   const PointState state = inflated_state(J);
-  PetscScalar P[9];
-  law.stress(state, P);
+  PetscScalar P[9] = {0};
+  if (constants) {
+    Point point = bare_point(state);
+    point.constants = constants;
+    law.functions(false).stress(point, P);
+  } else {
+    law.stress(state, P);
+  }
   return P[0] / (state.F[0] * state.F[0]); // dW/ds = 3 P, dJ/ds = 3 s^2
+}
+
+PetscReal inflation_volume(const TissueLaw &law, PetscReal wanted, const PetscScalar *constants, PetscReal *last)
+{
+  constexpr PetscReal step = 1.001;
+  constexpr int halvings = 60;
+  const auto pressure = [&](PetscReal J) { return inflation_pressure(law, J, constants); };
+  PetscReal J = 1, p = pressure(J);
+  const bool up = wanted >= p;
+  if (last) *last = p;
+  if (wanted == p) return J;
+  while (up ? p < wanted : p > wanted) {
+    J = up ? J * step : J / step;
+    const PetscReal q = pressure(J);
+    if (!(up ? q > p : q < p) || J < LawRange::least_J || J > LawRange::largest_J)
+      return std::numeric_limits<PetscReal>::quiet_NaN();
+    p = q;
+    if (last) *last = p;
+  }
+  PetscReal low = up ? J / step : J, high = up ? J : J * step;
+  for (int i = 0; i < halvings; ++i) {
+    const PetscReal middle = (low + high) / 2;
+    (pressure(middle) < wanted ? low : high) = middle;
+  }
+  return (low + high) / 2;
 }
 
 LawRange law_range(const TissueLaw &law)

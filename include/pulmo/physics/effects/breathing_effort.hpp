@@ -90,8 +90,8 @@ public:
   const char *about() const override { return "suction by the muscles of breathing, which follows the surface"; }
   std::string example() const override
   {
-    return "-breathing_effort -breathing_effort_pressure 2 -breathing_effort_rise 0.1 -breathing_effort_hold 0.05 "
-           "-breathing_effort_fall 0.1 -breathing_effort_period 0.3";
+    return "-breathing_effort -breathing_effort_pressure 2 -breathing_effort_rise 0.4 -breathing_effort_hold 0.05 "
+           "-breathing_effort_fall 0.1 -breathing_effort_period 0.6";
   }
   bool active() const override { return on_; }
 

@@ -14,63 +14,9 @@
 #include "pulmo/base/units.hpp"
 #include "pulmo/mesh/mesh.hpp"
 #include "pulmo/physics/effect.hpp"
-
-#include <limits>
+#include "pulmo/physics/law_range.hpp"
 
 namespace pulmo {
-
-/// The uniform inflation of a free piece of tissue, and its pressure.
-class FreeInflation {
-public:
-  /// @p constants: with the parameters of the law (TissueLaw::functions), or null for the law's own.
-  FreeInflation(const TissueLaw &law, const PetscScalar *constants) : law_(law), constants_(constants) {}
-
-  /// W'(J), kPa.
-  PetscReal pressure(PetscReal J) const
-  {
-    const PetscReal stretch = std::cbrt(J);
-    PetscScalar H[9] = {0}, P[9] = {0};
-    PointState state;
-    for (int i = 0; i < 9; i += 4) H[i] = stretch - 1;
-    make_point_state(H, nullptr, state);
-    if (constants_) {
-      Point point = bare_point(state);
-      point.constants = constants_;
-      law_.functions(false).stress(point, P);
-    } else {
-      law_.stress(state, P);
-    }
-    return P[0] / (stretch * stretch);
-  }
-  /// J on the way from rest on which pressure grows with J, or no number where that way ends before; @p last: the
-  /// pressure that it ends at.
-  PetscReal volume_at(PetscReal wanted, PetscReal *last = nullptr) const
-  {
-    constexpr PetscReal step = 1e-3, most = 20;
-    const bool up = wanted >= pressure(1);
-    PetscReal J = 1, p = pressure(1), next = 1;
-    if (last) *last = p;
-    for (; up ? p < wanted : p > wanted; J = next) {
-      next = up ? J * (1 + step) : J / (1 + step);
-      const PetscReal q = pressure(next);
-      if (!(up ? q > p : q < p) || !(next < most) || !(next > 1 / most))
-        return std::numeric_limits<double>::quiet_NaN();
-      p = q;
-      if (last) *last = p;
-    }
-    PetscReal low = up ? J / (1 + step) : J, high = up ? J : J * (1 + step);
-    if (J == 1) return 1;
-    for (int i = 0; i < 60; ++i) {
-      const PetscReal middle = (low + high) / 2;
-      (pressure(middle) < wanted ? low : high) = middle;
-    }
-    return (low + high) / 2;
-  }
-
-private:
-  const TissueLaw &law_;
-  const PetscScalar *constants_;
-};
 
 struct PrestressKernels {
   struct Parameters {
@@ -141,18 +87,17 @@ public:
 
   PetscErrorCode check(const Options &options, const Mesh &, const SceneFacts &facts) override
   {
-    const FreeInflation free(*facts.law, nullptr);
     PetscReal last, J0;
 
     PetscFunctionBeginUser;
     parameters_.pressure = facts.prestress->pressure;
-    J0 = free.volume_at(parameters_.pressure, &last);
+    J0 = inflation_volume(*facts.law, parameters_.pressure, nullptr, &last);
     PulmoUserCheck(!std::isnan(J0), options.comm(),
                    "-prestress_pressure %g cmH2O: -tissue %s with these parameters takes no more than %.3g cmH2O from "
                    "rest by uniform inflation; give a pressure below that, another law, or other parameters",
                    (double)pressure_, facts.law->name(), (double)(last / units::kPa_per_cmH2O));
     parameters_.stretch = std::cbrt(J0);
-    const PetscReal stiffness = slope(free, J0), at_rest = slope(free, 1);
+    const PetscReal stiffness = inflation_stiffness(*facts.law, J0), at_rest = inflation_stiffness(*facts.law, 1);
     if (stiffness < nearly_neutral * at_rest)
       PetscCall(PetscPrintf(options.comm(),
                             "pulmo: warning: -tissue %s is nearly neutral at -prestress_pressure %g cmH2O: dp/dJ is "
@@ -174,7 +119,7 @@ public:
     c.derive({&parameters_.stretch,
               [&law](const PetscScalar constants[]) {
                 const auto k = constants::get<P>(constants);
-                return std::cbrt(FreeInflation(law, constants).volume_at(k.pressure));
+                return std::cbrt(inflation_volume(law, k.pressure, constants));
               },
               "-prestress_pressure: -tissue " + std::string(law.name()) +
                   " with the parameters of some part of the lung does not take that pressure from rest by uniform "
@@ -188,13 +133,6 @@ public:
 
 private:
   static constexpr PetscReal nearly_neutral = 0.25;
-
-  /// dp/dJ, kPa.
-  static PetscReal slope(const FreeInflation &free, PetscReal J)
-  {
-    constexpr PetscReal step = 1e-5;
-    return (free.pressure(J * (1 + step)) - free.pressure(J * (1 - step))) / (2 * step * J);
-  }
 
   bool on_ = false;
   PetscReal pressure_ = 5;

@@ -17,6 +17,7 @@
 
 #include "pulmo/base/units.hpp"
 #include "pulmo/physics/effect.hpp"
+#include "pulmo/physics/law_range.hpp"
 
 #include <cmath>
 
@@ -198,13 +199,7 @@ private:
   static Limit limit(const TissueLaw &law, const SurfactantKernels::Parameters &k)
   {
     const auto pressure = [&](PetscReal J) {
-      const PetscReal stretch = std::cbrt(J) - 1;
-      const PetscScalar H[9] = {stretch, 0, 0, 0, stretch, 0, 0, 0, stretch};
-      PointState s;
-      PetscScalar P[9] = {0};
-      make_point_state(H, nullptr, s);
-      law.stress(s, P);
-      return P[0] / s.cof_F[0] + SurfactantKernels::at_rest(k) * (1 / std::cbrt(J) - 1);
+      return inflation_pressure(law, J) + SurfactantKernels::at_rest(k) * (1 / std::cbrt(J) - 1);
     };
     constexpr PetscReal step = 1e-3;
     Limit l{widest, 0, (pressure(1 + step) - pressure(1 - step)) / (2 * step)};

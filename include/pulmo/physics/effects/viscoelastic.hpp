@@ -152,7 +152,12 @@ public:
     PetscFunctionBeginUser;
     make_point_state(rest, nullptr, state);
     facts.law->tangent(state, A);
-    if (std::abs(A[4]) < least * std::abs(A[0])) // P_xy by F_xy, P_xx by F_xx
+    const bool no_shear = std::abs(A[4]) < least * std::abs(A[0]); // P_xy by F_xy, P_xx by F_xx
+    PulmoUserCheck(!no_shear || !facts.prestress, options.comm(),
+                   "-viscoelastic with -prestress and -tissue %s: that law has no stiffness against shear, and the "
+                   "overstress turns cells inside out at once; give another -tissue, or leave one of the two out",
+                   facts.law->name());
+    if (no_shear)
       PetscCall(
           PetscPrintf(options.comm(),
                       "pulmo: warning: -viscoelastic with -tissue %s: that law has no stiffness against shear, and "
