@@ -53,7 +53,27 @@ PetscErrorCode ParameterFields::setup(Options &options, const Composition &compo
     entries_.push_back(std::move(entry));
     offsets_.push_back(offset);
   }
+  PetscCall(check_relations(comm, composition));
   for (const DerivedParameter &parameter : composition.derived()) PetscCall(derive(comm, composition, parameter));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode ParameterFields::check_relations(MPI_Comm comm, const Composition &composition) const
+{
+  std::vector<PetscScalar> constants = composition.constants(Step());
+  PetscInt begin, end;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMPlexGetHeightStratum(composition.mesh().dm(), 0, &begin, &end));
+  for (const ParameterRelation &relation : composition.relations()) {
+    PetscInt wrong = 0;
+    for (PetscInt c = 0; c < end - begin; ++c) {
+      patch(c, "", constants);
+      if (!relation.holds(constants.data())) wrong = 1;
+    }
+    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &wrong, 1, MPIU_INT, MPI_MAX, comm));
+    PulmoUserCheck(!wrong, comm, "%s", relation.complaint.c_str());
+  }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -2,7 +2,7 @@
 /// Clinical numbers from the signals of a run; docs/clinical.md tells what each of them is and where it comes from.
 #pragma once
 
-#include "pulmo/time/signal_row.hpp"
+#include "pulmo/physics/signal_row.hpp"
 
 #include <cstddef>
 #include <optional>

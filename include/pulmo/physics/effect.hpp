@@ -10,8 +10,8 @@
 #include "pulmo/physics/permeability.hpp"
 #include "pulmo/physics/point.hpp"
 #include "pulmo/physics/scalars.hpp"
+#include "pulmo/physics/signal_row.hpp"
 #include "pulmo/physics/tissue_law.hpp"
-#include "pulmo/time/signal_row.hpp"
 
 #include <algorithm>
 #include <array>
@@ -183,6 +183,12 @@ struct DerivedParameter {
   std::string complaint;                                           ///< what a user reads where it is not a number
 };
 
+/// What parameters that may differ from place to place must be to each other.
+struct ParameterRelation {
+  std::function<bool(const PetscScalar constants[])> holds;
+  std::string complaint; ///< what a user reads where it does not
+};
+
 /// What the effects of a scene put together; filled by Effect::fields and Effect::terms.
 class Composition {
 public:
@@ -212,6 +218,9 @@ public:
   /// Says that a parameter which was handed over follows from others, and how.
   void derive(DerivedParameter parameter) { derived_.push_back(std::move(parameter)); }
   const std::vector<DerivedParameter> &derived() const { return derived_; }
+  /// Refuses a lung some part of which has parameters for which @p relation does not hold.
+  void require(ParameterRelation relation) { relations_.push_back(std::move(relation)); }
+  const std::vector<ParameterRelation> &relations() const { return relations_; }
 
   /// A residual term of the volume, e.g. residual("P : Grad eta", displacement, f1(volume_residual<P, K::stress>)).
   template <class... Slots>
@@ -402,6 +411,7 @@ private:
   std::vector<EnergyTerm> energies_;
   std::vector<ParameterBlock> parameters_;
   std::vector<DerivedParameter> derived_;
+  std::vector<ParameterRelation> relations_;
   std::vector<Reader> readers_;
   std::vector<MemorySpec> memories_;
   std::vector<RememberedIntegral> integrals_;

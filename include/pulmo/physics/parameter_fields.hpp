@@ -45,6 +45,8 @@ private:
                             const Options::Varying &varying, const std::vector<Mesh::Region> &regions, Entry &entry);
   /// Adds a parameter that follows from those before it.
   PetscErrorCode derive(MPI_Comm comm, const Composition &composition, const DerivedParameter &parameter);
+  /// Holds all cells against what parameters must be to each other.
+  PetscErrorCode check_relations(MPI_Comm comm, const Composition &composition) const;
   PetscErrorCode take_dataset(Options &options, const Mesh &mesh, const Options::Varying &varying, Entry &entry);
   PetscReal value(const Entry &entry, PetscInt cell, const std::string &surface) const;
 

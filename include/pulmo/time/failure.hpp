@@ -6,7 +6,7 @@
 #include "pulmo/fem/model.hpp"
 #include "pulmo/physics/law_range.hpp"
 #include "pulmo/physics/scene.hpp"
-#include "pulmo/time/signal_row.hpp"
+#include "pulmo/physics/signal_row.hpp"
 
 #include <optional>
 #include <string>

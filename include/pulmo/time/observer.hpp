@@ -4,7 +4,7 @@
 
 #include "pulmo/fem/archive.hpp"
 #include "pulmo/fem/assembly.hpp"
-#include "pulmo/time/signal_row.hpp"
+#include "pulmo/physics/signal_row.hpp"
 
 #include <vector>
 

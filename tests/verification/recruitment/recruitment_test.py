@@ -96,11 +96,11 @@ class Lung(unittest.TestCase):
         """One lung opens, the other does not; air goes where it opens."""
         run = pulmo.finished(["-dm_plex_filename", pulmo.mesh("lung_pair.msh"), "-elements", "P1-P1", "-output_fields_memory", "all"] +
                              pulmo.options_file("scenes/pcv.opts") + pulmo.DIRECT + pulmo.QUIET + [
-            "-tissue", LAW, "-ventilator_pip", "10", "-ventilator_inspiration", "1", "-ventilator_expiration", "0.1", "-recruitment", *NUMBERS,
-            "-recruitment_opening_pressure", "30,right_lung=4"])
+            "-tissue", LAW, "-ventilator_pip", "5", "-ts_max_time", "0.8", "-recruitment", *NUMBERS, "-recruitment_closing_pressure", "1",
+            "-recruitment_opening_pressure", "30,right_lung=2"])
         rows, whole = run.signals(), run.json()
         share = whole["regions"]["right_lung"]["reference_volume_ml"] / whole["reference_volume_ml"]
-        self.assertGreater(rows["open_share"].max(), 0.05)
+        self.assertGreater(rows["open_share"].max(), 0.02)
         self.assertLess(rows["open_share"].max(), share)
         _, _, values = pulmo.fields(run)
         names = [name for name in values if "open_share" in name]
@@ -111,6 +111,12 @@ class Lung(unittest.TestCase):
         most = sorted(open_share[region == n].max() for n in numbers)
         self.assertEqual(most[0], 0)
         self.assertGreater(most[1], 0.05)
+
+    def test_thresholds_of_a_part_are_checked(self):
+        run = pulmo.Case(["-dm_plex_filename", pulmo.mesh("lung_pair.msh")] + pulmo.options_file("scenes/pcv.opts") + pulmo.DIRECT + [
+            "-recruitment", "-recruitment_closing_pressure", "4,left_lung=20"])
+        self.assertEqual(run.code, 1)
+        self.assertIn("-recruitment_closing_pressure is above -recruitment_opening_pressure in some part", run.err)
 
 
 if __name__ == "__main__":

@@ -138,6 +138,13 @@ public:
     PetscFunctionBeginUser;
     PulmoUserCheck(!surfaces_.empty(), options.comm(), "-breathing_effort needs -breathing_effort_surfaces NAME,...");
     PetscCall(mesh.require_surfaces(surfaces_, "-breathing_effort_surfaces"));
+    if (facts.ventilator) {
+      const Phase &first = facts.ventilator->phases().front();
+      PulmoUserCheck(first.name != "settle" || !first.may_end_early(), options.comm(),
+                     "%s: the efforts of -breathing_effort begin when the phase 'settle' at the start of the run ends, "
+                     "which must have a time of its own: leave 'trigger' or 'cycle' out of it",
+                     first.where.c_str());
+    }
     for (const std::string &airway : facts.airway_surfaces) {
       if (mesh.surfaces().count(airway) == 0) continue;
       PetscCall(mesh.facets(airway, open));

@@ -172,6 +172,12 @@ public:
 
     PetscFunctionBeginUser;
     c.parameters(parameters_);
+    c.require({[](const PetscScalar constants[]) {
+                 const auto k = constants::get<P>(constants);
+                 return k.gamma_min <= k.gamma_eq && k.gamma_eq <= k.gamma_max;
+               },
+               "-surfactant_gamma_eq is not between -surfactant_gamma_min and -surfactant_gamma_max in some part of "
+               "the lung; give that part others"});
     if (gamma_ == "constant") {
       c.residual("(p_gamma - p_rest) cof F : Grad eta", displacement, f1(volume_residual<P, K::stress<false>>));
       c.jacobian("surface tension", displacement, displacement,
