@@ -52,15 +52,21 @@ PetscErrorCode Assembly::measure(Vec x, Measures &measures) const
 {
   const MPI_Comm comm = PetscObjectComm((PetscObject)dm_);
   const auto n_rule = static_cast<PetscInt>(rule_weights_.size());
-  struct {
-    double value;
-    int rank;
-  } least{PETSC_MAX_REAL, 0}, winner;
-  double volume = 0, extremes[2] = {-PETSC_MAX_REAL, -PETSC_MAX_REAL}; // max J, -(min J at points)
-  PetscInt where = -1;
+  struct Least {
+    double value = PETSC_MAX_REAL;
+    int rank = 0;
+  } least[2], winner[2];                                                   // of J, of the air
+  double volume = 0, extremes[3] = {-PETSC_MAX_REAL, -PETSC_MAX_REAL, -1}; // max J, -(min J, min air at points)
+  PetscInt where[2] = {-1, -1};
+  PetscMPIInt rank;
 
   PetscFunctionBeginUser;
-  PetscCallMPI(MPI_Comm_rank(comm, &least.rank));
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  least[0].rank = least[1].rank = rank;
+  if (needs_air_)
+    extremes[2] = -PETSC_MAX_REAL;
+  else
+    least[1].value = 1;
   const ReadArray xs(x);
   for (PetscInt c = 0; c < layout_.cells; ++c) {
     const CellDisplacement u(watched_, &invJ_[9 * c], cell_dofs(c), xs.data());
@@ -74,79 +80,42 @@ PetscErrorCode Assembly::measure(Vec x, Measures &measures) const
         sum += rule_weights_[q] * Jm1;
         extremes[1] = std::max(extremes[1], std::isnan(J) ? PETSC_MAX_REAL : -J);
       }
-      if (!(J >= least.value)) { // also taken when J is not a number
-        least.value = std::isnan(J) ? -PETSC_MAX_REAL : J;
-        where = c;
+      if (!(J >= least[0].value)) { // also taken when J is not a number
+        least[0].value = std::isnan(J) ? -PETSC_MAX_REAL : J;
+        where[0] = c;
+      }
+      if (!needs_air_) continue;
+      const double air = J - airless_J_[c]; // J that is not a number is told by min_J
+      if (q < n_rule) extremes[2] = std::max(extremes[2], -air);
+      if (air < least[1].value) {
+        least[1].value = air;
+        where[1] = c;
       }
     }
     volume += sum * detJ_[c];
   }
   PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &volume, 1, MPI_DOUBLE, MPI_SUM, comm));
-  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, extremes, 2, MPI_DOUBLE, MPI_MAX, comm));
-  PetscCallMPI(MPI_Allreduce(&least, &winner, 1, MPI_DOUBLE_INT, MPI_MINLOC, comm));
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, extremes, 3, MPI_DOUBLE, MPI_MAX, comm));
+  PetscCallMPI(MPI_Allreduce(least, winner, 2, MPI_DOUBLE_INT, MPI_MINLOC, comm));
   measures.volume_change = volume;
   measures.max_J = extremes[0];
   measures.min_J_points = -extremes[1];
-  measures.min_J = winner.value;
-  measures.rank = winner.rank;
-  PetscCall(share_place(where, measures));
-  if (needs_air_) PetscCall(measure_air(xs.data(), measures));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode Assembly::share_place(PetscInt cell, Measures &measures) const
-{
-  const MPI_Comm comm = PetscObjectComm((PetscObject)dm_);
-  PetscMPIInt rank;
-
-  PetscFunctionBeginUser;
-  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  measures.min_J = winner[0].value;
+  measures.min_air_points = -extremes[2];
+  measures.min_air = winner[1].value;
+  const int worst = measures.airless() ? 1 : 0;
+  const PetscInt cell = where[worst];
+  measures.rank = winner[worst].rank;
   measures.cell = cell;
-  if (measures.rank == rank && cell >= 0)
+  if (measures.rank == rank && cell >= 0) {
+    if (needs_air_) measures.airless_J = airless_J_[cell];
     for (int d = 0; d < 3; ++d) // reference coordinates of the centroid are -1/2
       measures.where[d] =
           v0_[3 * cell + d] + (J_[9 * cell + 3 * d] + J_[9 * cell + 3 * d + 1] + J_[9 * cell + 3 * d + 2]) / 2;
+  }
   PetscCallMPI(MPI_Bcast(measures.where, 3, MPIU_REAL, measures.rank, comm));
   PetscCallMPI(MPI_Bcast(&measures.cell, 1, MPIU_INT, measures.rank, comm));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode Assembly::measure_air(const PetscScalar *x, Measures &measures) const
-{
-  const MPI_Comm comm = PetscObjectComm((PetscObject)dm_);
-  const auto n_rule = static_cast<PetscInt>(rule_weights_.size());
-  struct {
-    double value;
-    int rank;
-  } least{PETSC_MAX_REAL, 0}, winner;
-  double at_points = PETSC_MAX_REAL;
-  PetscInt where = -1;
-
-  PetscFunctionBeginUser;
-  PetscCallMPI(MPI_Comm_rank(comm, &least.rank));
-  for (PetscInt c = 0; c < layout_.cells; ++c) {
-    const CellDisplacement u(watched_, &invJ_[9 * c], cell_dofs(c), x);
-    for (PetscInt q = 0; q < watched_points_; ++q) {
-      PetscScalar H[9];
-      u.gradient(q, H);
-      const double air = 1 + jacobian_minus_one(H) - airless_J_[c]; // J that is not a number is told by min_J
-      if (q < n_rule) at_points = std::min(at_points, air);
-      if (air < least.value) {
-        least.value = air;
-        where = c;
-      }
-    }
-  }
-  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &at_points, 1, MPI_DOUBLE, MPI_MIN, comm));
-  PetscCallMPI(MPI_Allreduce(&least, &winner, 1, MPI_DOUBLE_INT, MPI_MINLOC, comm));
-  measures.min_air = winner.value;
-  measures.min_air_points = at_points;
-  measures.airless_J = where >= 0 ? airless_J_[where] : 0;
-  PetscCallMPI(MPI_Bcast(&measures.airless_J, 1, MPIU_REAL, winner.rank, comm));
-  if (measures.airless()) {
-    measures.rank = winner.rank;
-    PetscCall(share_place(where, measures));
-  }
+  if (measures.airless()) PetscCallMPI(MPI_Bcast(&measures.airless_J, 1, MPIU_REAL, measures.rank, comm));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -40,7 +40,7 @@ public:
   /// The scalars that the fields see: the pressures of groups, and that of all gas where it has dofs of its own.
   std::vector<std::size_t> acting() const;
   PetscReal area() const { return area_; } ///< of all groups, mm^2
-  /// Whether the pressure is held (so at the start), or free.
+  /// The pressure is held from now on (so it is at the start), or free.
   void hold(bool held) { held_ = held; }
   /// The pressure that each scalar stands for, kPa; by number of the scalar.
   void set_pressures(std::vector<PetscReal> scalars) { value_ = std::move(scalars); }

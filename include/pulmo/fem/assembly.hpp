@@ -20,7 +20,7 @@ struct Measures {
   PetscReal min_J_points = 1;     ///< over quadrature points only
   PetscReal min_air = 1;          ///< least J - 1 + Phi0, where there must be air (Assembly::need_air); else 1
   PetscReal min_air_points = 1;   ///< over quadrature points only
-  PetscReal airless_J = 0;        ///< 1 - Phi0 of the cell with min_air
+  PetscReal airless_J = 0;        ///< 1 - Phi0 of that cell, if airless()
   PetscReal where[3] = {0, 0, 0}; ///< material centroid of the cell with min_J, with min_air if airless(), mm
   PetscInt cell = -1;             ///< its number on rank @p rank
   PetscMPIInt rank = 0;
@@ -92,10 +92,6 @@ private:
   struct Facets;
 
   PetscErrorCode setup_cells();
-  /// The least air; where it is if there is none.
-  PetscErrorCode measure_air(const PetscScalar *x, Measures &measures) const;
-  /// Tells all ranks where cell @p cell of rank measures.rank is.
-  PetscErrorCode share_place(PetscInt cell, Measures &measures) const;
   PetscErrorCode setup_facets();
   PetscErrorCode setup_varying(const ParameterFields &fields);
   /// Gathers coefficients in blocks of cells, then of facets, integrates each block and scatters the results.
