@@ -39,7 +39,7 @@ int main()
     const std::string alias = law->alias();
     std::printf("| `%s`%s |", law->name(), alias.empty() ? "" : (" (" + alias + ")").c_str());
     for (double p : pressures) {
-      const auto J = inflated_J(*law, range, p * units::kPa_per_cmH2O);
+      const auto J = inflated_J(*law, p * units::kPa_per_cmH2O);
       std::printf(" %s |", J ? number("%.3g", *J).c_str() : "none");
     }
     std::printf(" %s | %s | %s | %s | %s | %s |\n", shown(range.largest).c_str(), shown(range.least).c_str(),

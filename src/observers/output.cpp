@@ -173,8 +173,6 @@ PetscErrorCode SignalWriter::observe(const StepReport &step)
         std::fprintf(file_, ",pressure_%s_cmH2O", s.name.c_str());
         if (!s.surfaces.empty()) std::fprintf(file_, ",flow_%s_ml_per_s", s.name.c_str());
       }
-      for (const RememberedIntegral &integral : integrals_)
-        if (file_) std::fprintf(file_, ",%s", integral.name.c_str());
       for (const SignalSpec &s : signals_)
         if (file_) std::fprintf(file_, ",%s", s.name.c_str());
       if (file_) std::fprintf(file_, "\n");
@@ -192,7 +190,6 @@ PetscErrorCode SignalWriter::observe(const StepReport &step)
         std::fprintf(file_, ",%.15g", r.scalars[k]);
         if (!scalars_[k].surfaces.empty()) std::fprintf(file_, ",%.15g", r.scalar_flows[k]);
       }
-      for (const double integral : r.integrals) std::fprintf(file_, ",%.15g", integral);
       for (const SignalSpec &s : signals_) std::fprintf(file_, ",%.15g", s.value(r));
       std::fprintf(file_, "\n");
     }

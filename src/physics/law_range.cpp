@@ -178,40 +178,9 @@ std::string unstable_at_rest(const TissueLaw &law, const PetscScalar *constants)
 PetscReal inflation_pressure(const TissueLaw &law, PetscReal J, const PetscScalar *constants)
 {
   const PointState state = inflated_state(J);
-  PetscScalar P[9] = {0};
-  if (constants) {
-    Point point = bare_point(state);
-    point.constants = constants;
-    law.functions(false).stress(point, P);
-  } else {
-    law.stress(state, P);
-  }
+  PetscScalar P[9];
+  law.stress(state, constants, P);
   return P[0] / (state.F[0] * state.F[0]); // dW/ds = 3 P, dJ/ds = 3 s^2
-}
-
-PetscReal inflation_volume(const TissueLaw &law, PetscReal wanted, const PetscScalar *constants, PetscReal *last)
-{
-  constexpr PetscReal step = 1.001;
-  constexpr int halvings = 60;
-  const auto pressure = [&](PetscReal J) { return inflation_pressure(law, J, constants); };
-  PetscReal J = 1, p = pressure(J);
-  const bool up = wanted >= p;
-  if (last) *last = p;
-  if (wanted == p) return J;
-  while (up ? p < wanted : p > wanted) {
-    J = up ? J * step : J / step;
-    const PetscReal q = pressure(J);
-    if (!(up ? q > p : q < p) || J < LawRange::least_J || J > LawRange::largest_J)
-      return std::numeric_limits<PetscReal>::quiet_NaN();
-    p = q;
-    if (last) *last = p;
-  }
-  PetscReal low = up ? J / step : J, high = up ? J : J * step;
-  for (int i = 0; i < halvings; ++i) {
-    const PetscReal middle = (low + high) / 2;
-    (pressure(middle) < wanted ? low : high) = middle;
-  }
-  return (low + high) / 2;
 }
 
 LawRange law_range(const TissueLaw &law)
@@ -239,24 +208,30 @@ LawRange law_range(const TissueLaw &law)
   return range;
 }
 
-std::optional<PetscReal> inflated_J(const TissueLaw &law, const LawRange &range, PetscReal pressure)
+std::optional<PetscReal> inflated_J(const TissueLaw &law, PetscReal pressure, const PetscScalar *constants,
+                                    LawRange::State *end)
 {
   constexpr int halvings = 100;
-  constexpr PetscReal step = 1.01;
+  const auto is_number = [&](PetscReal J) { return std::isfinite(law.energy(inflated_state(J), constants)); };
   const auto excess = [&](PetscReal J) { // a barrier holds any suction, an overflow any pressure
-    if (!std::isfinite(law.energy(inflated_state(J)))) return J < 1 ? -PETSC_MAX_REAL : PETSC_MAX_REAL;
-    return inflation_pressure(law, J) - pressure;
+    if (!is_number(J)) return J < 1 ? -PETSC_MAX_REAL : PETSC_MAX_REAL;
+    return inflation_pressure(law, J, constants) - pressure;
   };
-  PetscReal low = 1, high = 1;
-  if (excess(1) < 0) {
-    const PetscReal end = range.largest ? range.largest->J : LawRange::largest_J;
-    while (high < end && excess(high) < 0) high = std::min(high * step, end);
-    if (excess(high) < 0) return {};
-  } else {
-    const PetscReal end = range.least ? range.least->J : LawRange::least_J;
-    while (low > end && excess(low) > 0) low = std::max(low / step, end);
-    if (excess(low) > 0) return {};
-  }
+  const bool up = excess(1) < 0;
+  const auto reaches = [&](PetscReal J) { return up ? excess(J) >= 0 : excess(J) <= 0; };
+  PetscReal last = 1;
+  // the search for a limit of pressure ends where the pressure is reached
+  const auto stiffness = [&](PetscReal J) {
+    const PetscReal dp_dJ =
+        is_number(J) ? inflation_stiffness(law, J, constants) : std::numeric_limits<PetscReal>::quiet_NaN();
+    last = J;
+    return dp_dJ >= 0 && reaches(J) ? std::numeric_limits<PetscReal>::quiet_NaN() : dp_dJ;
+  };
+  const auto limit = first_loss(up ? LawRange::largest_J : LawRange::least_J, stiffness);
+  if (limit) last = *limit;
+  if (end) *end = {last, is_number(last) ? inflation_pressure(law, last, constants) : excess(last)};
+  if (!reaches(last)) return {};
+  PetscReal low = up ? 1 : last, high = up ? last : 1;
   for (int n = 0; n < halvings; ++n) {
     const PetscReal J = (low + high) / 2;
     (excess(J) < 0 ? low : high) = J;

@@ -35,7 +35,10 @@ PetscErrorCode ParameterFields::setup(Options &options, const Composition &compo
   PetscFunctionBeginUser;
   entries_.clear();
   offsets_.clear();
-  if (options.varying().empty()) PetscFunctionReturn(PETSC_SUCCESS);
+  if (options.varying().empty()) {
+    PetscCall(check_relations(comm, composition));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
   PetscCall(mesh.regions(regions));
   for (const Options::Varying &v : options.varying()) {
     const char *owner = nullptr;
@@ -67,7 +70,7 @@ PetscErrorCode ParameterFields::check_relations(MPI_Comm comm, const Composition
   PetscCall(DMPlexGetHeightStratum(composition.mesh().dm(), 0, &begin, &end));
   for (const ParameterRelation &relation : composition.relations()) {
     PetscInt wrong = 0;
-    for (PetscInt c = 0; c < end - begin; ++c) {
+    for (PetscInt c = 0; c < (empty() ? std::min<PetscInt>(1, end - begin) : end - begin); ++c) {
       patch(c, "", constants);
       if (!relation.holds(constants.data())) wrong = 1;
     }
@@ -91,7 +94,7 @@ PetscErrorCode ParameterFields::derive(MPI_Comm comm, const Composition &composi
   entry.everywhere = *parameter.target;
   for (PetscInt c = 0; c < end - begin; ++c) {
     patch(c, "", constants);
-    entry.of_cell.push_back(parameter.value(constants.data()));
+    entry.of_cell.push_back(parameter.value(constants));
     if (std::isnan(entry.of_cell.back())) wrong = 1;
   }
   PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &wrong, 1, MPIU_INT, MPI_MAX, comm));

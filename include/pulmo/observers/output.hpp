@@ -69,8 +69,7 @@ private:
 class SignalWriter final : public Observer {
 public:
   SignalWriter(MPI_Comm comm, const Output &output, const SceneFacts &facts, const Composition &composition)
-      : comm_(comm), output_(output), facts_(facts), integrals_(composition.integrals()),
-        signals_(composition.signals())
+      : comm_(comm), output_(output), facts_(facts), signals_(composition.signals())
   {
     for (const ScalarGroup &group : composition.scalar_groups())
       scalars_.insert(scalars_.end(), group.scalars.begin(), group.scalars.end());
@@ -84,7 +83,6 @@ private:
   const Output &output_;
   const SceneFacts &facts_;
   std::vector<ScalarSpec> scalars_; ///< each has columns of its own
-  std::vector<RememberedIntegral> integrals_;
   std::vector<SignalSpec> signals_;
   std::FILE *file_ = nullptr;
 };

@@ -158,12 +158,11 @@ struct Quantity {
   std::string name, unit;
 };
 
-/// A column of the signals: an integral over the lung of what an effect remembers in the cells.
+/// An integral over the lung of what an effect remembers in the cells (SignalRow::integrals).
 struct RememberedIntegral {
   std::string effect;
   std::size_t quantity; ///< number among those of the effect
-  std::string name;     ///< with its unit
-  PetscReal factor;     ///< from mm^3 times the quantity's unit to that
+  PetscReal factor;     ///< of mm^3 times the quantity's unit
 };
 
 /// What one effect remembers there.
@@ -178,12 +177,12 @@ struct MemorySpec {
 
 /// A parameter of a kernel that follows from others, wherever these differ from place to place.
 struct DerivedParameter {
-  const PetscScalar *target;                                       ///< in a block of parameters
-  std::function<PetscScalar(const PetscScalar constants[])> value; ///< from what all effects handed over
-  std::string complaint;                                           ///< what a user reads where it is not a number
+  const PetscScalar *target;                                            ///< in a block of parameters
+  std::function<PetscScalar(std::vector<PetscScalar> constants)> value; ///< from what all effects handed over
+  std::string complaint;                                                ///< what a user reads where it is not a number
 };
 
-/// What parameters that may differ from place to place must be to each other.
+/// What parameters must be to each other, in every part of the lung.
 struct ParameterRelation {
   std::function<bool(const PetscScalar constants[])> holds;
   std::string complaint; ///< what a user reads where it does not
@@ -218,7 +217,7 @@ public:
   /// Says that a parameter which was handed over follows from others, and how.
   void derive(DerivedParameter parameter) { derived_.push_back(std::move(parameter)); }
   const std::vector<DerivedParameter> &derived() const { return derived_; }
-  /// Refuses a lung some part of which has parameters for which @p relation does not hold.
+  /// Refuses a lung that has parameters, all over or in some part, for which @p relation does not hold.
   void require(ParameterRelation relation) { relations_.push_back(std::move(relation)); }
   const std::vector<ParameterRelation> &relations() const { return relations_; }
 
@@ -263,7 +262,8 @@ public:
   /// speaks remembers in the cells, times @p factor.
   void integrate(std::size_t quantity, const std::string &name, PetscReal factor)
   {
-    integrals_.push_back({effect_, quantity, name, factor});
+    signal(name, [i = integrals_.size()](const SignalRow &row) { return row.integrals[i]; });
+    integrals_.push_back({effect_, quantity, factor});
   }
   const std::vector<RememberedIntegral> &integrals() const { return integrals_; }
   /// Scalars that are remembered at a point of a cell, or of a facet of @p surface.

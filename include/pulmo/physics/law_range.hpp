@@ -29,13 +29,8 @@ PetscReal inflation_stiffness(const TissueLaw &law, PetscReal J, const PetscScal
 /// plane wave may grow by itself. A law's own stress at rest counts in both; no stiffness against shear at all (CM5)
 /// is allowed.
 std::string unstable_at_rest(const TissueLaw &law, const PetscScalar *constants = nullptr);
-/// p = dW/dJ of tissue that inflates freely, kPa. @p constants: with the law's parameters among these; J is counted
-/// from where the law itself is at rest, whatever shape they say to be free of stress.
+/// p = dW/dJ of tissue that inflates freely, kPa.
 PetscReal inflation_pressure(const TissueLaw &law, PetscReal J, const PetscScalar *constants = nullptr);
-/// J at which that pressure is @p wanted, on the way from rest on which it changes with J in one sense; no number where
-/// that way ends before. @p last: the pressure at its end.
-PetscReal inflation_volume(const TissueLaw &law, PetscReal wanted, const PetscScalar *constants = nullptr,
-                           PetscReal *last = nullptr);
 
 /// Where free inflation from rest ends, with the parameters that no region has for itself. What is empty does not end
 /// between LawRange::least_J and largest_J.
@@ -53,7 +48,10 @@ struct LawRange {
 };
 LawRange law_range(const TissueLaw &law);
 
-/// J of free inflation from rest to a pressure (kPa); nothing if the law does not hold it within @p range.
-std::optional<PetscReal> inflated_J(const TissueLaw &law, const LawRange &range, PetscReal pressure);
+/// J of free inflation from rest to a pressure (kPa); nothing if dp/dJ turns negative before, or J leaves the range
+/// above. @p end: where it ends then. With @p constants of which StressFree::forget() was called, rest is that of the
+/// law.
+std::optional<PetscReal> inflated_J(const TissueLaw &law, PetscReal pressure, const PetscScalar *constants = nullptr,
+                                    LawRange::State *end = nullptr);
 
 } // namespace pulmo

@@ -29,6 +29,13 @@ struct StressFree {
   static constexpr int most = 4;
   PetscScalar count = 0;
   PetscScalar function[most] = {0}; ///< StressFreeFunction, as constants::to_scalar() packs them
+
+  /// Lets @p all, the constants of PetscDS, be those of tissue that is free of stress in the shape of the mesh.
+  static void forget(std::vector<PetscScalar> &all)
+  {
+    const PetscInt offset = constants::offset_of(constants::tag(owner), all.data());
+    if (offset > 0) all[static_cast<std::size_t>(offset)] = 0;
+  }
 };
 
 /// The deformation gradient that the tissue feels.

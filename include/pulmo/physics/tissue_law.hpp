@@ -270,19 +270,29 @@ struct StrainedKernels {
   using Kernels = TissueKernels<Law>;
   using Parameters = Both<typename Law::Parameters, StressFree>;
 
-  static void stress(const Point &point, const Parameters &k, PetscScalar f1[])
+  template <When when>
+  static void stress_when(const Point &point, const Parameters &k, PetscScalar f1[])
   {
-    const FeltState felt(point, point.state, k.other, When::now);
+    const FeltState felt(point, point.state, k.other, when);
     PetscScalar P[9] = {0};
     Kernels::stress(bare_point(felt.state), k.own, P);
     felt.add_stress(P, f1);
   }
-  static void tangent(const Point &point, const Parameters &k, PetscScalar g3[])
+  template <When when>
+  static void tangent_when(const Point &point, const Parameters &k, PetscScalar g3[])
   {
-    const FeltState felt(point, point.state, k.other, When::now);
+    const FeltState felt(point, point.state, k.other, when);
     PetscScalar A[81] = {0};
     Kernels::tangent(bare_point(felt.state), k.own, A);
     felt.add_tangent(A, g3);
+  }
+  static void stress(const Point &point, const Parameters &k, PetscScalar f1[])
+  {
+    stress_when<When::now>(point, k, f1);
+  }
+  static void tangent(const Point &point, const Parameters &k, PetscScalar g3[])
+  {
+    tangent_when<When::now>(point, k, g3);
   }
   // the stress-free shape at the start of the step is told by what @p now remembers
   static PetscScalar stored(const Point &now, const Point &before, const Parameters &k)
@@ -336,8 +346,9 @@ public:
   virtual LawFunctions functions(bool strained) const = 0;
   /// The same law with all derivatives from its W by dual numbers (tests compare both).
   virtual std::unique_ptr<TissueLaw> energy_alone() const = 0;
-  /// Strain energy density W at a state, kPa.
-  virtual PetscScalar energy(const PointState &state) const = 0;
+  /// Strain energy density W at a state, kPa, with the law's parameters among @p constants, or its own if null.
+  virtual PetscScalar energy(const PointState &state, const PetscScalar *constants) const = 0;
+  PetscScalar energy(const PointState &state) const { return energy(state, nullptr); }
   /// P' in an accepted state, kPa. With @p constants (Model::constants_at): with the parameters and the stress-free
   /// shape that they hold, of which effects know by @p accepted (PointMemory; of all of them); null: dW/dF with the
   /// law's own parameters.
@@ -363,6 +374,7 @@ template <class Law>
 class TissueLawOf final : public TissueLaw {
 public:
   using Kernels = TissueKernels<Law>;
+  using Strained = StrainedKernels<Law>;
   using Parameters = typename Law::Parameters;
 
   TissueLawOf() = default;
@@ -379,7 +391,6 @@ public:
   }
   LawCallbacks callbacks(bool strained) const override
   {
-    using Strained = StrainedKernels<Law>;
     if (!strained) return callbacks_of<Kernels>();
     LawCallbacks callbacks = callbacks_of<Strained>();
     callbacks.released = energy_density<typename Strained::Parameters, Strained::released>;
@@ -387,39 +398,41 @@ public:
   }
   LawFunctions functions(bool strained) const override
   {
-    return strained ? functions_of<StrainedKernels<Law>>() : functions_of<Kernels>();
+    return strained ? functions_of<Strained>() : functions_of<Kernels>();
   }
   std::unique_ptr<TissueLaw> energy_alone() const override
   {
     using Alone = std::conditional_t<has_derivatives<Law>, EnergyAlone<Law>, Law>;
     return std::make_unique<TissueLawOf<Alone>>(parameters_);
   }
-  PetscScalar energy(const PointState &state) const override { return Kernels::energy(state, parameters_); }
+  using TissueLaw::energy;
   using TissueLaw::stress;
   using TissueLaw::tangent;
+  PetscScalar energy(const PointState &state, const PetscScalar *constants) const override
+  {
+    return Kernels::energy(state, constants ? constants::get<Parameters>(constants) : parameters_);
+  }
   void stress(const PointState &state, const PetscScalar *constants, const Memory &accepted,
               PetscScalar P[9]) const override
   {
     for (int i = 0; i < 9; ++i) P[i] = 0;
     if (!constants) return Kernels::stress(bare_point(state), parameters_, P);
-    const auto parameters = constants::get<typename StrainedKernels<Law>::Parameters>(constants);
-    if (parameters.other.count == 0) return Kernels::stress(bare_point(state), parameters.own, P);
-    const FeltState felt(remembering(state, constants, accepted), state, parameters.other, When::accepted);
-    PetscScalar own[9] = {0};
-    Kernels::stress(bare_point(felt.state), parameters.own, own);
-    felt.add_stress(own, P);
+    const auto k = constants::get<typename Strained::Parameters>(constants);
+    if (k.other.count > 0)
+      Strained::template stress_when<When::accepted>(remembering(state, constants, accepted), k, P);
+    else
+      Kernels::stress(bare_point(state), k.own, P);
   }
   void tangent(const PointState &state, const PetscScalar *constants, const Memory &accepted,
                PetscScalar A[81]) const override
   {
     for (int i = 0; i < 81; ++i) A[i] = 0;
     if (!constants) return Kernels::tangent(bare_point(state), parameters_, A);
-    const auto parameters = constants::get<typename StrainedKernels<Law>::Parameters>(constants);
-    if (parameters.other.count == 0) return Kernels::tangent(bare_point(state), parameters.own, A);
-    const FeltState felt(remembering(state, constants, accepted), state, parameters.other, When::accepted);
-    PetscScalar own[81] = {0};
-    Kernels::tangent(bare_point(felt.state), parameters.own, own);
-    felt.add_tangent(own, A);
+    const auto k = constants::get<typename Strained::Parameters>(constants);
+    if (k.other.count > 0)
+      Strained::template tangent_when<When::accepted>(remembering(state, constants, accepted), k, A);
+    else
+      Kernels::tangent(bare_point(state), k.own, A);
   }
 
 private:

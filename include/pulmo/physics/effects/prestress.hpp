@@ -16,6 +16,8 @@
 #include "pulmo/physics/effect.hpp"
 #include "pulmo/physics/law_range.hpp"
 
+#include <limits>
+
 namespace pulmo {
 
 struct PrestressKernels {
@@ -87,15 +89,16 @@ public:
 
   PetscErrorCode check(const Options &options, const Mesh &, const SceneFacts &facts) override
   {
-    PetscReal last, J0;
+    LawRange::State end;
 
     PetscFunctionBeginUser;
     parameters_.pressure = facts.prestress->pressure;
-    J0 = inflation_volume(*facts.law, parameters_.pressure, nullptr, &last);
-    PulmoUserCheck(!std::isnan(J0), options.comm(),
+    const auto inflated = inflated_J(*facts.law, parameters_.pressure, nullptr, &end);
+    PulmoUserCheck(inflated, options.comm(),
                    "-prestress_pressure %g cmH2O: -tissue %s with these parameters takes no more than %.3g cmH2O from "
                    "rest by uniform inflation; give a pressure below that, another law, or other parameters",
-                   (double)pressure_, facts.law->name(), (double)(last / units::kPa_per_cmH2O));
+                   (double)pressure_, facts.law->name(), (double)(end.pressure / units::kPa_per_cmH2O));
+    const PetscReal J0 = *inflated;
     parameters_.stretch = std::cbrt(J0);
     const PetscReal at_rest = inflation_stiffness(*facts.law, 1);
     PetscReal stiffness = inflation_stiffness(*facts.law, J0); // the least on the way there
@@ -127,9 +130,10 @@ public:
     PetscFunctionBeginUser;
     c.parameters(parameters_);
     c.derive({&parameters_.stretch,
-              [&law](const PetscScalar constants[]) {
-                const auto k = constants::get<P>(constants);
-                return std::cbrt(inflation_volume(law, k.pressure, constants));
+              [&law](std::vector<PetscScalar> constants) {
+                StressFree::forget(constants);
+                const auto J0 = inflated_J(law, constants::get<P>(constants.data()).pressure, constants.data());
+                return J0 ? std::cbrt(*J0) : std::numeric_limits<PetscScalar>::quiet_NaN();
               },
               "-prestress_pressure: -tissue " + std::string(law.name()) +
                   " with the parameters of some part of the lung does not take that pressure from rest by uniform "

@@ -138,10 +138,6 @@ public:
     PetscFunctionBeginUser;
     PulmoUserCheck(facts.airflow || facts.ventilator, options.comm(),
                    "-recruitment needs a gas pressure: give -ventilator, -airflow or both");
-    PulmoUserCheck(parameters_.closing_pressure <= parameters_.opening_pressure, options.comm(),
-                   "-recruitment_closing_pressure %g cmH2O is above -recruitment_opening_pressure %g: between the two "
-                   "airspaces would open and close at once; give a lower one",
-                   (double)parameters_.closing_pressure, (double)parameters_.opening_pressure);
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
@@ -157,12 +153,13 @@ public:
     parameters_.suction = constants::to_scalar(facts.pleural_suction);
     parameters_.prestress = facts.prestress ? facts.prestress->pressure : 0;
     c.parameters(parameters_);
-    c.require({[](const PetscScalar constants[]) {
-                 const auto k = constants::get<P>(constants);
-                 return k.closing_pressure <= k.opening_pressure;
-               },
-               "-recruitment_closing_pressure is above -recruitment_opening_pressure in some part of the lung: between "
-               "the two airspaces would open and close at once; give that part a lower one"});
+    c.require(
+        {[](const PetscScalar constants[]) {
+           const auto k = constants::get<P>(constants);
+           return k.closing_pressure <= k.opening_pressure;
+         },
+         "-recruitment_closing_pressure is above -recruitment_opening_pressure in some part of the lung (or all of "
+         "it): between the two airspaces would open and close at once; give that part a lower one"});
     c.remember({{"open_share", "1"}, {"recruited_volume", "1"}}, remembered<P, K::remember>);
     c.integrate(0, "open_share", 1 / c.mesh().volume());
     c.integrate(1, "recruited_volume_ml", 1 / units::mm3_per_ml);

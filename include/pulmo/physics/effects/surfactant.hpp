@@ -156,11 +156,6 @@ public:
   PetscErrorCode check(const Options &options, const Mesh &, const SceneFacts &facts) override
   {
     PetscFunctionBeginUser;
-    PulmoUserCheck(parameters_.gamma_min <= parameters_.gamma_eq && parameters_.gamma_eq <= parameters_.gamma_max,
-                   options.comm(),
-                   "-surfactant_gamma_eq %.6g mN/m is not between -surfactant_gamma_min %.6g and -surfactant_gamma_max "
-                   "%.6g",
-                   (double)parameters_.gamma_eq, (double)parameters_.gamma_min, (double)parameters_.gamma_max);
     PetscCall(tell_softening(options.comm(), *facts.law));
     PetscFunctionReturn(PETSC_SUCCESS);
   }
@@ -177,7 +172,7 @@ public:
                  return k.gamma_min <= k.gamma_eq && k.gamma_eq <= k.gamma_max;
                },
                "-surfactant_gamma_eq is not between -surfactant_gamma_min and -surfactant_gamma_max in some part of "
-               "the lung; give that part others"});
+               "the lung (or all of it); give others there"});
     if (gamma_ == "constant") {
       c.residual("(p_gamma - p_rest) cof F : Grad eta", displacement, f1(volume_residual<P, K::stress<false>>));
       c.jacobian("surface tension", displacement, displacement,
