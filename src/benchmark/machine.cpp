@@ -64,9 +64,8 @@ double multiply_adds()
 double triad(std::vector<double> &a, const std::vector<double> &b, const std::vector<double> &c)
 {
   return best_rate(24.0 * static_cast<double>(a.size()), [&] {
-    double *x = a.data();
-    const double *y = b.data(), *z = c.data();
-#pragma GCC ivdep
+    double *__restrict x = a.data();
+    const double *__restrict y = b.data(), *__restrict z = c.data();
     for (std::size_t i = 0; i < a.size(); ++i) x[i] = y[i] + 3.0 * z[i];
     sink += x[a.size() / 2];
   });
@@ -79,7 +78,7 @@ double reading(const std::vector<double> &a)
     const double *x = a.data();
     for (std::size_t i = 0; i + 32 <= a.size(); i += 32)
 #pragma GCC unroll 8
-      for (int k = 0; k < 8; ++k) sum[k] += *reinterpret_cast<const Vector4 *>(x + i + 4 * k);
+      for (int k = 0; k < 8; ++k) sum[k] += *reinterpret_cast<const pulmo::Vector4InArray *>(x + i + 4 * k);
     for (const Vector4 &s : sum) sink += s[0];
   });
 }

@@ -277,9 +277,10 @@ PetscErrorCode Checkpoint::persist_numerics(Archive &archive)
   if (!archive.reading() || !numerics_changed_.empty()) PetscFunctionReturn(PETSC_SUCCESS);
   const OptionList then = named_values(text);
   const auto compare = [&](const OptionList &list, const OptionList &other) {
-    for (const auto &[name, value] : list) {
+    for (const auto &option : list) {
+      const std::string &name = option.first;
       const auto elsewhere = value_in(other, name);
-      if (!numerics_changed_.empty() || (elsewhere && Options::same_value(value, *elsewhere))) continue;
+      if (!numerics_changed_.empty() || (elsewhere && Options::same_value(option.second, *elsewhere))) continue;
       const auto told = [&](const OptionList &l) {
         const auto known = value_in(l, name);
         return known ? "'" + *known + "'" : "not given";

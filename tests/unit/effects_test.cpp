@@ -19,7 +19,7 @@ namespace {
 /// k(J) = k0 J^m + k1 J: a law whose derivative does not vanish.
 struct TestPermeability {
   struct Parameters {
-    static constexpr const char *owner = "permeability";
+    [[maybe_unused]] static constexpr const char *owner = "permeability";
     PetscScalar k0 = 0.8, m = 2.5, k1 = 0.3;
   };
   static PermeabilityValue permeability(PetscScalar J, const Parameters &p)

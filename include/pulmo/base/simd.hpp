@@ -4,8 +4,10 @@
 
 namespace pulmo {
 
-/// Four doubles, at any address of a double: the components of a node, or four entries of a row.
-typedef double Vector4 __attribute__((vector_size(32), aligned(8), may_alias));
+/// Four doubles: the components of a node, or four entries of a row.
+typedef double Vector4 __attribute__((vector_size(32)));
+/// Four that lie in an array, at any address of a double. A template that deduces its type forgets that.
+typedef double Vector4InArray __attribute__((vector_size(32), aligned(8), may_alias));
 
 /// Nodes of the largest element whose components are gathered into vectors.
 constexpr int max_nodes = 32;

@@ -37,13 +37,13 @@ private:
   std::size_t used_ = 0;
 };
 
-static inline const Vector4 &four(const double *p)
+static inline const Vector4InArray &four(const double *p)
 {
-  return *reinterpret_cast<const Vector4 *>(p);
+  return *reinterpret_cast<const Vector4InArray *>(p);
 }
-static inline Vector4 &four(double *p)
+static inline Vector4InArray &four(double *p)
 {
-  return *reinterpret_cast<Vector4 *>(p);
+  return *reinterpret_cast<Vector4InArray *>(p);
 }
 
 /// out = s[0] G_0 + s[1] G_1 + s[2] G_2 for three rows of @p n doubles, one after the other; n is a multiple of 4.

@@ -75,9 +75,9 @@ public:
     const auto at = [](const Place &x, double larger) {
       Place y{0, 0, 0};
       if (x[0] <= 0) return y;
-      const double part[3] = {x[0] - x[1], x[1] - x[2], x[2]};
+      const double share[3] = {x[0] - x[1], x[1] - x[2], x[2]};
       double size = 0;
-      for (int d = 0; d < 3; ++d) y[d] = std::sin(M_PI / 2 * part[d] / x[0]);
+      for (int d = 0; d < 3; ++d) y[d] = std::sin(M_PI / 2 * share[d] / x[0]);
       for (double v : y) size += v * v;
       for (double &v : y) v *= larger * x[0] / std::sqrt(size);
       return y;
