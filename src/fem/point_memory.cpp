@@ -10,18 +10,28 @@ namespace pulmo {
 
 PetscErrorCode PointMemory::setup(const Model &model)
 {
-  PetscSection section;
-  PetscInt size;
-
   PetscFunctionBeginUser;
   model_ = &model;
   PetscCall(sampling_.setup(model));
   for (const MemorySpec &spec : model.composition().memories())
     if (!room(spec.surface)) PetscCall(add_room(spec.surface));
-  PetscCall(DMGetLocalSection(model.dm(), &section));
+  PetscCall(begin());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode PointMemory::begin()
+{
+  PetscSection section;
+  PetscInt size;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMGetLocalSection(model_->dm(), &section));
   PetscCall(PetscSectionGetStorageSize(section, &size));
   const std::vector<PetscScalar> zero(static_cast<std::size_t>(size), 0);
-  for (Room &r : rooms_) PetscCall(evaluate(0, zero.data(), nullptr, Step(Stage(1, 0, true)), true, r, r.last_));
+  for (Room &r : rooms_) {
+    PetscCall(take_given(r));
+    PetscCall(evaluate(0, zero.data(), nullptr, Step(Stage(1, 0, true)), true, r, r.last_));
+  }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -87,6 +97,22 @@ Memory PointMemory::Room::accepted(PetscInt i, PetscInt q) const
   return {state.data() + static_cast<std::size_t>((i * points_ + q) * width_), nullptr};
 }
 
+/// Fills what is given at the start.
+PetscErrorCode PointMemory::take_given(Room &r) const
+{
+  PetscFunctionBeginUser;
+  for (const MemorySpec *spec : r.specs_) {
+    if (!given(*spec)) continue;
+    const std::size_t n = spec->quantities.size(), points = r.places_.size() * static_cast<std::size_t>(r.points_);
+    PetscCheck(spec->start->size() == n * points, PETSC_COMM_SELF, PETSC_ERR_ARG_SIZ, "%s is given at other points",
+               spec->effect.c_str());
+    for (std::size_t i = 0; i < points; ++i)
+      std::copy_n(spec->start->data() + i * n, n,
+                  r.last_.data() + i * static_cast<std::size_t>(r.width_) + static_cast<std::size_t>(spec->offset));
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode PointMemory::evaluate(PetscReal t, const PetscScalar *x, const PetscScalar *rate, const Step &step,
                                      bool start, Room &r, std::vector<PetscScalar> &values) const
 {
@@ -101,8 +127,10 @@ PetscErrorCode PointMemory::evaluate(PetscReal t, const PetscScalar *x, const Pe
     if (!start) sampling_.sample(e, rate, rates);
     for (PetscInt q = 0; q < r.points_; ++q, value += r.width_) {
       if (!start) Sampling::take_rates(rates[q], now[q]);
-      const Point point = sampling_.point(now[q], e, t, step, start ? Memory() : r.at(static_cast<PetscInt>(i), q));
-      for (const MemorySpec *spec : r.specs_) spec->value(point, constants, value + spec->offset);
+      Point point = sampling_.point(now[q], e, t, step, r.at(static_cast<PetscInt>(i), q));
+      point.start = start;
+      for (const MemorySpec *spec : r.specs_)
+        if (!start || !given(*spec)) spec->value(point, constants, value + spec->offset);
     }
   }
   PetscFunctionReturn(PETSC_SUCCESS);

@@ -154,6 +154,10 @@ PetscErrorCode unloaded_volume(const Scene &scene, const Model &model, PetscReal
   PetscInt begin, end;
 
   PetscFunctionBeginUser;
+  if (scene.facts().prestress->unloading) {
+    volume = scene.facts().prestress->unloading->volume;
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
   PetscCall(DMPlexGetHeightStratum(model.dm(), 0, &begin, &end));
   volume = 0;
   for (PetscInt c = begin; c < end; ++c) {

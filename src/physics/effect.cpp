@@ -48,7 +48,7 @@ void Composition::remember(std::vector<Quantity> quantities, Callback<MemoryFunc
       offset = std::max(offset, m.offset + static_cast<PetscInt>(m.quantities.size()));
   for (const MemorySpec &m : memories_) // kernels know one place for all surfaces
     if (!m.surface.empty() && !surface.empty() && same_owner(m.owner, value.owners[0])) offset = m.offset;
-  memories_.push_back({effect_, surface, value.owners[0], std::move(quantities), value.function, offset});
+  memories_.push_back({effect_, surface, value.owners[0], std::move(quantities), value.function, nullptr, offset});
   note_readers(effect_, "memory", surface, value.owners);
 }
 

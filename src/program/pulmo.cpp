@@ -8,6 +8,7 @@
 #include "pulmo/physics/parameter_fields.hpp"
 #include "pulmo/program/error_estimate.hpp"
 #include "pulmo/program/notes.hpp"
+#include "pulmo/program/unloading.hpp"
 
 #include <algorithm>
 #include <csignal>
@@ -205,6 +206,7 @@ PetscErrorCode Run::setup()
   PetscCall(check_prescribed_once(composition));
   PetscCall(pin_free_motions(composition));
   PetscCall(reference_modulus(scene_.tissue().law(), composition, modulus));
+  PetscCall(solve_unloaded_shape(options_, scene_, model_, composition, modulus));
   PetscCall(model_.build(std::move(composition), modulus));
   PetscCall(check_stable_at_rest(options_, scene_, model_)); // before any load is looked at
   PetscCall(settle_under_loads(scene_, model_, settle_note_));

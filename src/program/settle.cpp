@@ -3,6 +3,7 @@
 
 #include "pulmo/base/units.hpp"
 
+#include <algorithm>
 #include <sstream>
 
 namespace pulmo {
@@ -12,9 +13,9 @@ namespace {
 /// Rounding may leave as much in the (dimensionless) momentum rows of a lung that nothing loads.
 constexpr PetscReal rounding = 1e-12;
 
-/// What loads the undeformed lung while its gas is at atmospheric pressure; empty if nothing does. @p model is not in a
-/// run yet.
-PetscErrorCode load_at_rest(Model &model, std::string &load)
+/// What loads the undeformed lung while its gas is at atmospheric pressure; empty if nothing does, or no more than
+/// @p faint. @p model is not in a run yet.
+PetscErrorCode load_at_rest(Model &model, PetscReal faint, std::string &load)
 {
   const PetscInt field = displacement;
   VecHandle x, rate, local, global;
@@ -47,7 +48,7 @@ PetscErrorCode load_at_rest(Model &model, std::string &load)
   PetscCall(VecGetSubVector(global, rows, &momentum));
   PetscCall(VecNorm(momentum, NORM_INFINITY, &force));
   PetscCall(VecRestoreSubVector(global, rows, &momentum));
-  if (force > rounding) load = "forces on the undeformed lung";
+  if (force > faint) load = "forces on the undeformed lung";
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -62,7 +63,10 @@ PetscErrorCode settle_under_loads(Scene &scene, Model &model, std::string &note)
   PetscFunctionBeginUser;
   note.clear();
   if (!settling.programme && !settling.off) PetscFunctionReturn(PETSC_SUCCESS);
-  PetscCall(load_at_rest(model, load));
+  const auto &prestress = scene.facts().prestress;
+  const PetscReal solved =
+      prestress && prestress->unloading ? 2 * prestress->unloading->left : 0; // in the run it adds up anew
+  PetscCall(load_at_rest(model, std::max(rounding, solved), load));
   if (load.empty() && settling.off && settling.pressure) load = "the pressure at which the programme begins";
   if (load.empty()) PetscFunctionReturn(PETSC_SUCCESS);
   if (settling.off) {

@@ -314,6 +314,21 @@ PetscErrorCode register_p_multigrid()
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode precondition_one_field(KSP ksp)
+{
+  char type[64] = "";
+  PetscBool fieldsplit;
+  PC pc;
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscOptionsGetString(nullptr, nullptr, "-pc_type", type, sizeof(type), nullptr));
+  PetscCall(PetscStrcmp(type, PCFIELDSPLIT, &fieldsplit));
+  if (!fieldsplit) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(KSPGetPC(ksp, &pc));
+  PetscCall(PCSetOptionsPrefix(pc, "fieldsplit_displacement_"));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode attach_rigid_body_modes(DM dm)
 {
   const PetscInt field = displacement;

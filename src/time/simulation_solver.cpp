@@ -141,9 +141,8 @@ PetscErrorCode Simulation::create_solver()
   const MPI_Comm comm = options_.comm();
   SNES snes;
   KSP ksp;
-  PC pc;
   TSAdapt adapt;
-  PetscBool has_pc, is_fieldsplit = PETSC_FALSE, is_lu = PETSC_FALSE, is_cholesky = PETSC_FALSE;
+  PetscBool has_pc, is_lu = PETSC_FALSE, is_cholesky = PETSC_FALSE;
   char pc_type[64] = "";
 
   PetscFunctionBeginUser;
@@ -151,7 +150,6 @@ PetscErrorCode Simulation::create_solver()
   PulmoUserCheck(
       has_pc, comm,
       "no linear solver: give a solver file, e.g. -options_file petsc_options/solvers/direct.opts (or -pc_type)");
-  PetscCall(PetscStrcmp(pc_type, PCFIELDSPLIT, &is_fieldsplit));
   PetscCall(PetscStrcmp(pc_type, PCLU, &is_lu));
   PetscCall(PetscStrcmp(pc_type, PCCHOLESKY, &is_cholesky));
   PulmoUserCheck(
@@ -183,11 +181,7 @@ PetscErrorCode Simulation::create_solver()
   PetscCall(TSAdaptSetCheckStage(adapt, check_stage));
   PetscCall(TSGetSNES(ts_, &snes));
   PetscCall(SNESGetKSP(snes, &ksp));
-  if (is_fieldsplit && !scene_.facts().airflow) {
-    // one field: what a solver file says of the displacement split preconditions the whole
-    PetscCall(KSPGetPC(ksp, &pc));
-    PetscCall(PCSetOptionsPrefix(pc, "fieldsplit_displacement_"));
-  }
+  if (!scene_.facts().airflow) PetscCall(precondition_one_field(ksp));
   PetscCall(SNESSetComputeInitialGuess(snes, initial_guess, this));
   PetscCall(compat::set_from_options(ts_));
   PetscCall(offer_fixed_stress(ksp));

@@ -273,6 +273,7 @@ using MatHandle = Handle<Mat, MatDestroy>;
 using QuadratureHandle = Handle<PetscQuadrature, PetscQuadratureDestroy>;
 using SectionHandle = Handle<PetscSection, PetscSectionDestroy>;
 using SFHandle = Handle<PetscSF, PetscSFDestroy>;
+using SNESHandle = Handle<SNES, SNESDestroy>;
 using TSHandle = Handle<TS, TSDestroy>;
 using VecHandle = Handle<Vec, VecDestroy>;
 

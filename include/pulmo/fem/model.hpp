@@ -21,6 +21,8 @@ public:
   ~Model();
   /// Declares -quadrature_degree; its default and least value are those of @p elements.
   PetscErrorCode declare(Options &options, const Elements &elements);
+  /// The rule of @p other, in place of declare().
+  void integrate_as(const Model &other) { quadrature_degree_ = other.quadrature_degree_; }
   /// @p modulus: tissue stiffness that scales the equations, kPa. The composition's effects must outlive the model.
   PetscErrorCode build(Composition composition, PetscReal modulus);
 

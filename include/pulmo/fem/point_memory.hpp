@@ -16,6 +16,8 @@ public:
   /// Allocates what @p model's effects remember and fills it with what they say of the start. @p model must outlive
   /// this.
   PetscErrorCode setup(const Model &model);
+  /// Fills it anew, where what is given at the start has changed (Composition::begin_with).
+  PetscErrorCode begin();
   /// Memory of this rank: of all effects, or of what @p spec declares.
   std::size_t bytes() const;
   std::size_t bytes(const MemorySpec &spec) const;
@@ -73,6 +75,8 @@ public:
 
 private:
   PetscErrorCode add_room(const std::string &surface);
+  static bool given(const MemorySpec &spec) { return spec.start && !spec.start->empty(); }
+  PetscErrorCode take_given(Room &room) const;
   /// Calls the effects' own functions at all points.
   PetscErrorCode evaluate(PetscReal t, const PetscScalar *x, const PetscScalar *rate, const Step &step, bool start,
                           Room &room, std::vector<PetscScalar> &values) const;

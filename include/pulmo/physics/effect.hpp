@@ -172,7 +172,9 @@ struct MemorySpec {
   const char *owner;   ///< of the parameters of its kernels
   std::vector<Quantity> quantities;
   MemoryFunction value; ///< what they are in a state
-  PetscInt offset = 0;  ///< among the scalars of a point
+  /// What they are at the start, [cell][point][quantity], where that is not for @p value to say; null: it is.
+  std::shared_ptr<const std::vector<PetscScalar>> start;
+  PetscInt offset = 0; ///< among the scalars of a point
 };
 
 /// A parameter of a kernel that follows from others, wherever these differ from place to place.
@@ -257,6 +259,9 @@ public:
   /// once for an accepted step, and at the start (memory.last is null then). Kernels there whose parameters have the
   /// same owner see what is remembered. An effect that remembers on several surfaces remembers the same on each.
   void remember(std::vector<Quantity> quantities, Callback<MemoryFunction> value, const std::string &surface = "");
+  /// Says what the quantities that were declared last are at the start: [cell][point][quantity], filled before
+  /// Model::build().
+  void begin_with(std::shared_ptr<const std::vector<PetscScalar>> start) { memories_.back().start = std::move(start); }
   const std::vector<MemorySpec> &memories() const { return memories_; }
   /// Adds a column to the signals: the integral over the lung of quantity @p quantity of those that the effect which
   /// speaks remembers in the cells, times @p factor.
@@ -347,6 +352,16 @@ public:
   void vary(std::shared_ptr<const ParameterFields> fields) { varying_ = std::move(fields); }
   /// Null where there are none.
   const ParameterFields *varying() const { return varying_.get(); }
+  /// The same parameters and memory, and of the fields the displacement alone: for another problem on this mesh.
+  Composition without_terms() const
+  {
+    Composition other(mesh_, elements_);
+    other.fields_.push_back(fields_.front());
+    other.parameters_ = parameters_;
+    other.memories_ = memories_;
+    other.varying_ = varying_;
+    return other;
+  }
   /// The place of @p parameter among the constants, or -1; @p owner: of its block.
   PetscInt constant_at(const PetscReal *parameter, const char **owner) const;
   /// The surfaces on which terms read the parameters of @p owner.
@@ -448,13 +463,49 @@ struct Settling {
 /// Gravity, as others may know it.
 struct GravityFacts {
   std::array<PetscReal, 3> down{}; ///< unit vector along it
+  PetscReal force = 0;             ///< weight of 1 kg/m^3, kPa/mm
+  PetscReal air_density = 0;       ///< kg/m^3
   Callback<EnergyDensity> mass;    ///< of tissue and air at a point, kg per m^3 of reference volume (1e-3 g/ml)
+};
+
+/// A stress-free shape that has to be solved for before a run (pulmo/program/unloading.hpp).
+struct Unloading {
+  /// Weight of the lung per volume of the mesh, as the tissue has to carry it, kPa/mm; null: it has none.
+  std::function<void(const PetscScalar constants[], PetscReal weight[3])> weight;
+  /// Adds the terms of the problem; its unknown is where the tissue goes once it is unloaded.
+  std::function<void(Composition &)> terms;
+  /// What is known of a point of a cell.
+  struct AtPoint : std::array<PetscScalar, 13> {
+    static constexpr int F0 = 0;      ///< takes the stress-free shape to the mesh, 9
+    static constexpr int pleural = 9; ///< pressure less than that of the gas, kPa
+    static constexpr int gradient =
+        10; ///< its slope, kPa/mm, 3; while the shape is looked for, all that balances weight
+    static constexpr int count = 13;
+
+    explicit AtPoint(PetscScalar pressure) : std::array<PetscScalar, 13>{1, 0, 0, 0, 1, 0, 0, 0, 1, pressure, 0, 0, 0}
+    {}
+    static std::vector<Quantity> quantities()
+    {
+      std::vector<Quantity> list;
+      for (int i = 0; i < 9; ++i) list.push_back({std::string("F0_") + "xyz"[i / 3] + "xyz"[i % 3], ""});
+      list.push_back({"pleural_suction", "kPa"});
+      for (char d : {'x', 'y', 'z'}) list.push_back({std::string("pleural_slope_") + d, "kPa/mm"});
+      return list;
+    }
+  };
+  /// Filled by the solution, [cell][point][AtPoint].
+  std::shared_ptr<std::vector<PetscScalar>> points = std::make_shared<std::vector<PetscScalar>>();
+  PetscReal pressure = 0; ///< transpulmonary, kPa
+  PetscReal left = 0;     ///< norm of the residual (Model) that the solution leaves
+  PetscReal volume = 0;   ///< of the stress-free shape, mm^3
 };
 
 /// A lung that is under pressure in the shape of the mesh, as others may know it.
 struct PrestressFacts {
-  PetscReal pressure = 0;                                         ///< transpulmonary, kPa
-  std::function<PetscReal(const PetscScalar constants[])> volume; ///< unloaded, over that of the mesh
+  PetscReal pressure = 0; ///< transpulmonary, kPa
+  std::function<PetscReal(const PetscScalar constants[])>
+      volume;                           ///< unloaded, over that of the mesh; without unloading
+  std::shared_ptr<Unloading> unloading; ///< null: none is needed
 };
 
 /// What one effect may know of the scene beside itself.

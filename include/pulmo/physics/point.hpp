@@ -189,6 +189,12 @@ struct PlaceMemory {
   static Memory find(const PetscReal at[3], const PetscScalar c[]);
 };
 
+/// Whether the effect with parameters @p P is given what it remembers at the start (Composition::begin_with).
+template <class P, class = void>
+constexpr bool given_at_start = false;
+template <class P>
+constexpr bool given_at_start<P, std::void_t<decltype(P::given_at_start)>> = P::given_at_start;
+
 /// A quadrature point as a kernel sees it.
 struct Point {
   const PointState &state;   ///< F, J, Grad u_t
@@ -207,6 +213,7 @@ struct Point {
   Memory memory{};                        ///< of the kernel's own effect
   const PetscScalar *constants = nullptr; ///< what all effects handed over (for LawFunctions)
   Memory of_all{};                        ///< of all effects
+  bool start = false;                     ///< nothing was accepted yet: of_all holds what was given at the start alone
 
   /// The share of the past in the rate of quantity @p i that the effect remembers: dy/dt = step.slope y + past(i).
   PetscScalar past(int i) const
@@ -219,7 +226,8 @@ struct Point {
   Point as_seen_by(const PetscScalar c[]) const
   {
     Point other = *this;
-    other.memory = constants::memory(of_all, P::owner, normal != nullptr, c);
+    other.memory = {};
+    if (!start || given_at_start<P>) other.memory = constants::memory(of_all, P::owner, normal != nullptr, c);
     return other;
   }
   /// Pressure of the gas in the pores: the local field, or the uniform pressure without airflow, kPa.
@@ -353,7 +361,9 @@ template <class P>
 Point own_memory(Point point, const PetscScalar c[])
 {
   point.of_all = point.memory;
-  if constexpr (!std::is_empty_v<P>)
+  if (point.start)
+    point.memory = {};
+  else if constexpr (!std::is_empty_v<P>)
     if (point.memory.last)
       point.memory = constants::memory(point.memory, owners_of<P>()[0], point.normal != nullptr, c);
   point.constants = c;

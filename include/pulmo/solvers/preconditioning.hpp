@@ -16,6 +16,9 @@ PetscErrorCode register_p_multigrid();
 
 /// Makes matrices of the displacement field of @p dm, also after a fieldsplit, carry the six rigid-body modes.
 PetscErrorCode attach_rigid_body_modes(DM dm);
+/// For a matrix of the displacement alone: where -pc_type is fieldsplit, what a solver file says of the displacement
+/// split preconditions the whole. To be called before options are taken.
+PetscErrorCode precondition_one_field(KSP ksp);
 
 /// The fixed-stress approximation of the Schur complement on the pressure,
 ///   S = A_pp + sum over cells of c M / |M|,  c = (1' A_pu w)(w' A_up 1)/(w' A_uu w),

@@ -8,7 +8,9 @@ import subprocess
 import sys
 import unittest
 
+import h5py
 import numpy as np
+from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 HERE = os.path.dirname(os.path.abspath(__file__))
@@ -142,6 +144,121 @@ class HollowSphere(unittest.TestCase):
         limit = volumes[1] + (volumes[1] - volumes[0]) / ((levels[1] / levels[0]) ** 2 - 1)
         self.assertLess(np.abs(limit - exact).max() / exact.max(), 2e-3)
         self.assertGreater(abs(plain[-1] / exact[-1] - 1), 0.1)  # it matters
+
+
+class Inverse(unittest.TestCase):
+    """The unloaded shape that is solved for, and the lung that is loaded again."""
+    INVERSE = ON + ["-prestress_method", "inverse"]
+    WEIGHT = ["-gravity", "-tissue_porosity", "0.75"]
+
+    def test_uniform_tissue_without_weight_is_stretched_uniformly(self):
+        for law in ("birzle", "patte"):
+            with self.subTest(law=law):
+                breath = pulmo.LUNG + pulmo.PCV + pulmo.TIGHT + pulmo.STILL + ["-tissue", law, "-elements", "P1-P1", "-ts_max_time", "0.1",
+                                                                               "-ventilator_pip", "2"] + pulmo.QUIET
+                stretch, inverse = (pulmo.finished(breath + on) for on in (ON, self.INVERSE))
+                self.assertGreater(stretch.signals()["volume_ml"][-1], 10)
+                np.testing.assert_allclose(inverse.signals()["volume_ml"], stretch.signals()["volume_ml"], atol=1e-8)
+                unloaded = [run.json()["prestress"]["unloaded_volume_ratio"] for run in (stretch, inverse)]
+                self.assertAlmostEqual(unloaded[0], unloaded[1], delta=1e-11)
+
+    def test_shells_of_two_tissues(self):
+        """The unloaded volume against the radial equations, on meshes of a hollow sphere."""
+        inner, outer, levels, ratios = 30.0, 72.5, (3, 5), []
+        laws = (Birzle(), Birzle(c=3 * Birzle.c))
+        for divisions in levels:
+            mesh, dataset = pulmo.scratch("shells.msh"), pulmo.scratch("shells.h5")
+            subprocess.run([os.path.join(pulmo.SOURCE, "tools", "sphere_mesh"), "--divisions", str(divisions), "--layers", str(2 * divisions),
+                            "--inner", str(inner), "--outer", str(outer), "--output", mesh], check=True, capture_output=True)
+            nodes, cells = tetrahedra(mesh)
+            radii = np.unique(np.round(np.linalg.norm(nodes, axis=1), 6))
+            between = radii[divisions]
+            self.assertEqual(len(radii), 2 * divisions + 1)
+            outside = np.linalg.norm(nodes[cells], axis=2).max(axis=1) > between + 1e-3
+            with h5py.File(dataset, "w") as file:
+                file["c"] = np.where(outside, laws[1].c, laws[0].c)
+            run = pulmo.finished(["-dm_plex_filename", mesh, "-tissue_c", dataset + ":c", "-ts_max_time", "0.1", "-ventilator", "pcv", "-ventilator_pip", "0",
+                                  "-tissue", "birzle", "-chest_wall", "-chest_wall_surfaces", "pleura"] + pulmo.STILL + pulmo.DIRECT + self.INVERSE + pulmo.QUIET)
+            ratios.append(run.json()["prestress"]["unloaded_volume_ratio"])
+            self.assertLess(np.abs(run.signals()["max_J"] - 1).max(), 1e-8)
+        exact = unloaded_ratio(laws, (inner, between, outer), PRESTRESS * pulmo.KPA_PER_CMH2O)
+        errors = [abs(r / exact - 1) for r in ratios]
+        print("\nunloaded shells: ratio", ratios, "exact", exact, "off by", errors)
+        self.assertLess(errors[1], 0.6 * errors[0])
+        self.assertLess(errors[1], 1e-3)
+
+    def test_a_lung_under_its_weight_stays_where_it_is(self):
+        """Two lungs of two tissues and densities, on one rank and on two: u = 0 to 1e-8 of a litre, and no settling."""
+        ratios = []
+        for ranks in (1, 2):
+            run = pulmo.finished(["-dm_plex_filename", pulmo.mesh("lung_pair.msh"), "-elements", "P1-P1", "-ventilator_pip", "0", "-ts_max_time", "0.1",
+                                  "-tissue", "yoshihara", "-tissue_c", "0.36,left_lung=0.72"] + pulmo.PCV + pulmo.TIGHT + pulmo.STILL + self.INVERSE
+                                 + ["-gravity", "-tissue_porosity", "0.75,left_lung=0.7"] + pulmo.QUIET, ranks=ranks)
+            rows = run.signals()
+            self.assertLess(np.abs(rows["volume_ml"]).max(), 1e-5)
+            self.assertLess(np.abs(rows["max_J"] - 1).max(), 1e-8)
+            self.assertNotIn("settle", rows["phase"])
+            ratios.append(run.json()["prestress"]["unloaded_volume_ratio"])
+        self.assertAlmostEqual(*ratios, delta=1e-10)
+
+    def test_low_parts_ventilate_more(self):
+        """In the supine lung, per volume, as in a living one: with the weight in the unloaded shape, and not with a uniform stretch."""
+        scene = (pulmo.LUNG + pulmo.options_file("scenes/pcv.opts") + pulmo.DIRECT + pulmo.STILL + self.WEIGHT + pulmo.QUIET
+                 + ["-tissue", "ma", "-elements", "P1-P1", "-chest_wall_surfaces", "pleura", "-chest_wall_direction", "normal", "-prestress", "-ts_dt", "0.2"])
+
+        def low_to_high(method):
+            thirds = pulmo.finished(scene + ["-prestress_method", method]).json()["gravity"]
+            low, high = (thirds[k] for k in ("dependent", "nondependent"))
+            return low["ventilation_ml"] / low["reference_volume_ml"] / (high["ventilation_ml"] / high["reference_volume_ml"])
+
+        self.assertGreater(low_to_high("inverse"), 1.3)
+        self.assertLess(low_to_high("stretch"), 1)
+
+    def test_a_weight_off_centre_is_told(self):
+        run = pulmo.finished(["-dm_plex_filename", pulmo.mesh("lung_pair.msh"), "-elements", "P1-P1", "-ts_max_time", "0.1"] + pulmo.PCV + pulmo.DIRECT
+                             + pulmo.STILL + self.INVERSE + ["-tissue", "yoshihara", "-gravity", "-tissue_porosity", "0.75"] + pulmo.QUIET)
+        self.assertNotIn("from the centre of a lung's volume", run.out)
+
+    def test_newtons_matrix(self):
+        """d sigma/d f against finite differences."""
+        run = pulmo.Case(pulmo.CUBE + pulmo.PCV + pulmo.TIGHT + pulmo.STILL + self.INVERSE + self.WEIGHT + ["-tissue", "birzle", "-gravity_acceleration", "1000",
+                         "-mesh_scale", "10", "-elements", "P1-P1", "-ts_max_time", "0.05", "-snes_test_jacobian", "-snes_max_it", "3"] + pulmo.QUIET)
+        ratios = [float(line.split("=")[1].split(",")[0]) for line in run.out.splitlines() if "||J - Jfd||_F/||J||_F" in line]
+        self.assertGreater(len(ratios), 2, run.out + run.err)
+        self.assertLess(max(ratios), 1e-6)
+
+
+def tetrahedra(path):
+    """(nodes [n, 3], cells [m, 4]) of a mesh in MSH 2.2 whose nodes are numbered from 1."""
+    lines = iter(open(path))
+    nodes, cells = [], []
+    for line in lines:
+        if line.startswith("$Nodes"):
+            nodes = [next(lines).split()[1:4] for _ in range(int(next(lines)))]
+        elif line.startswith("$Elements"):
+            rows = [[int(word) for word in next(lines).split()] for _ in range(int(next(lines)))]
+            cells = [row[-4:] for row in rows if row[1] == 4]
+    return np.array(nodes, float), np.array(cells) - 1
+
+
+def unloaded_ratio(laws, radii, pressure):
+    """Volume without load over that under @p pressure (kPa) of a hollow sphere of two tissues, loaded inside and outside.
+
+    With r of the loaded sphere and R(r) without load: l_r = 1/R', l_t = r/R, sigma_r = P_r/l_t^2, sigma_t = P_t/(l_r l_t),
+    sigma_r' = 2 (sigma_t - sigma_r)/r.
+    """
+    def across(R0):
+        state = np.array([R0, pressure])
+        for law, r0, r1 in zip(laws, radii, radii[1:]):
+            def slope(r, y):
+                t = r / y[0]
+                l = brentq(lambda l: law.stress(l, t)[0] / t**2 - y[1], 0.5, 2.5, xtol=1e-14)
+                return [1 / l, 2 * (law.stress(l, t)[1] / (l * t) - y[1]) / r]
+            state = solve_ivp(slope, (r0, r1), state, rtol=1e-10, atol=1e-12).y[:, -1]
+        return state
+
+    R0 = brentq(lambda R0: across(R0)[1] - pressure, 0.8 * radii[0], radii[0], xtol=1e-10)
+    return (across(R0)[0] ** 3 - R0**3) / (radii[2] ** 3 - radii[0] ** 3)
 
 
 if __name__ == "__main__":

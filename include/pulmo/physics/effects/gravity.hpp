@@ -67,7 +67,6 @@ public:
 
   PetscErrorCode declare(Options &options) override
   {
-    constexpr PetscReal kPa_per_mm = 1e-6; // of 1 kg/m^3 times 1 m/s^2: 1 Pa/m
     PetscReal direction[3] = {0, -1, 0};
 
     PetscFunctionBeginUser;
@@ -98,7 +97,8 @@ public:
   PetscErrorCode announce(SceneFacts &facts) override
   {
     facts.porosity = true;
-    facts.gravity = GravityFacts{down_, energy_density<GravityKernels::Parameters, GravityKernels::mass>};
+    facts.gravity = GravityFacts{down_, kPa_per_mm * acceleration_, air_density_,
+                                 energy_density<GravityKernels::Parameters, GravityKernels::mass>};
     return PETSC_SUCCESS;
   }
 
@@ -124,6 +124,8 @@ public:
   }
 
 private:
+  static constexpr PetscReal kPa_per_mm = 1e-6; ///< of 1 kg/m^3 times 1 m/s^2: 1 Pa/m
+
   bool on_ = false;
   PetscReal acceleration_ = 9.80665, air_density_ = 1.2; ///< m/s^2, kg/m^3
   std::array<PetscReal, 3> down_{};
