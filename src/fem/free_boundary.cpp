@@ -7,28 +7,6 @@
 
 namespace pulmo {
 
-namespace {
-
-/// The facets of one cell alone, over all ranks.
-PetscErrorCode outer_facets(DM dm, std::vector<PetscInt> &facets)
-{
-  PetscInt begin, end, point_end;
-
-  PetscFunctionBeginUser;
-  PetscCall(DMPlexGetChart(dm, nullptr, &point_end));
-  PetscCall(DMPlexGetHeightStratum(dm, 1, &begin, &end));
-  std::vector<PetscInt> cells(static_cast<std::size_t>(point_end), 0);
-  for (PetscInt f = begin; f < end; ++f) PetscCall(DMPlexGetSupportSize(dm, f, &cells[f]));
-  const std::vector<PetscInt> here = cells;
-  PetscCall(combine_shared(dm, MPI_SUM, cells));
-  facets.clear();
-  for (PetscInt f = begin; f < end; ++f)
-    if (cells[f] == 1 && here[f] == 1) facets.push_back(f);
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-} // namespace
-
 PetscErrorCode find_free_boundary(const Composition &composition, std::vector<FreeBoundary> &parts)
 {
   const Mesh &mesh = composition.mesh();
