@@ -203,22 +203,44 @@ void PointMemory::means(const MemorySpec &spec, std::size_t index, std::vector<P
 PetscErrorCode PointMemory::integrals(std::vector<double> &values) const
 {
   const Composition &composition = model_->composition();
+  const MPI_Comm comm = PetscObjectComm((PetscObject)model_->dm());
   std::vector<PetscScalar> of_cells;
+  std::vector<double> largest;
 
   PetscFunctionBeginUser;
   values.clear();
   for (const RememberedIntegral &integral : composition.integrals()) {
-    const auto spec = std::find_if(composition.memories().begin(), composition.memories().end(),
-                                   [&](const auto &m) { return m.effect == integral.effect && m.surface.empty(); });
-    PetscCheck(spec != composition.memories().end(), PETSC_COMM_SELF, PETSC_ERR_ARG_WRONG,
-               "%s integrates what it does not remember", integral.effect.c_str());
-    means(*spec, integral.quantity, of_cells);
-    double sum = 0;
-    for (const Sampling::Element &e : sampling_.cells()) sum += e.measure * of_cells[e.cell];
+    const bool cells = integral.over == Over::cells;
+    bool known = false;
+    double sum = 0, most = -std::numeric_limits<double>::max();
+    for (const MemorySpec &spec : composition.memories()) {
+      if (spec.effect != integral.effect || spec.surface.empty() != cells) continue;
+      known = true;
+      if (cells) {
+        means(spec, integral.quantity, of_cells);
+        for (const Sampling::Element &e : sampling_.cells()) sum += e.measure * of_cells[e.cell];
+      } else {
+        const Room &r = *room(spec.surface);
+        const std::vector<PetscScalar> &state = pending_ ? r.next_ : r.last_;
+        std::size_t at = static_cast<std::size_t>(spec.offset) + integral.quantity;
+        for (const Sampling::Element &e : r.places_)
+          for (const PetscReal weight : sampling_.weights(e)) {
+            sum += weight * e.measure * state[at];
+            most = std::max(most, state[at]);
+            at += static_cast<std::size_t>(r.width_);
+          }
+      }
+    }
+    PetscCheck(known, PETSC_COMM_SELF, PETSC_ERR_ARG_WRONG, "%s integrates what it does not remember",
+               integral.effect.c_str());
     values.push_back(integral.factor * sum);
+    largest.push_back(integral.factor * most);
   }
-  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, values.data(), static_cast<PetscMPIInt>(values.size()), MPI_DOUBLE, MPI_SUM,
-                             PetscObjectComm((PetscObject)model_->dm())));
+  const auto n = static_cast<PetscMPIInt>(values.size());
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, values.data(), n, MPI_DOUBLE, MPI_SUM, comm));
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, largest.data(), n, MPI_DOUBLE, MPI_MAX, comm));
+  for (std::size_t i = 0; i < values.size(); ++i)
+    if (composition.integrals()[i].over == Over::largest_of_facets) values[i] = largest[i];
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -256,6 +256,10 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
     if (model.composition().supported())
       json["support_reaction_n"] = simulation.support_reaction() * units::newton_per_kPa_mm2;
     if (model.composition().pinned()) json["pin_force_n"] = simulation.pins().largest() * units::newton_per_kPa_mm2;
+    for (const SignalLimit &limit : model.composition().limits()) {
+      const SignalSpec &signal = model.composition().signals()[limit.signal];
+      json["largest_" + signal.name] = largest(signal, simulation.rows());
+    }
     json["min_jacobian"] = simulation.min_J();
     if (scene.facts().airflow) {
       const std::vector<double> least = audits.regions.least_porosity(simulation.rows());

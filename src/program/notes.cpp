@@ -202,6 +202,22 @@ PetscErrorCode warn_of_shrinking(MPI_Comm comm, const Simulation &simulation, co
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+/// Columns of the signals that rose above what an effect says they should.
+PetscErrorCode warn_of_limits(MPI_Comm comm, const Composition &composition, const std::vector<SignalRow> &rows)
+{
+  PetscFunctionBeginUser;
+  for (const SignalLimit &limit : composition.limits()) {
+    const SignalSpec &signal = composition.signals()[limit.signal];
+    const auto first =
+        std::find_if(rows.begin(), rows.end(), [&](const SignalRow &row) { return signal.value(row) > limit.most; });
+    if (first != rows.end())
+      PetscCall(PetscPrintf(comm, "pulmo: warning: at t = %g s %s is %.3g, and in the run up to %.3g: %s\n",
+                            first->time, signal.name.c_str(), signal.value(*first), largest(signal, rows),
+                            limit.complaint.c_str()));
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 } // namespace
 
 PetscErrorCode note_weightless(MPI_Comm comm, const Scene &scene, const GravityAudit &gravity)
@@ -263,6 +279,7 @@ PetscErrorCode look_back(MPI_Comm comm, const Options &options, const Scene &sce
   PetscCall(warn_of_no_air(comm, options, scene, simulation, regions));
   if (!scene.facts().settling.off || !settles) // else loads that act at rest are told already
     PetscCall(warn_of_shrinking(comm, simulation, regions));
+  PetscCall(warn_of_limits(comm, model.composition(), simulation.rows()));
   PetscCall(simulation.pins().warn(model));
   for (const SignalRow &row : simulation.rows()) // steps that were cut
     if (row.dt > 0) PetscCall(warn_of_equal_order(comm, scene, model, row.dt, warned_of_elements));

@@ -17,6 +17,7 @@
 #include <array>
 #include <cmath>
 #include <functional>
+#include <limits>
 #include <memory>
 #include <optional>
 #include <string>
@@ -158,11 +159,31 @@ struct Quantity {
   std::string name, unit;
 };
 
-/// An integral over the lung of what an effect remembers in the cells (SignalRow::integrals).
+/// How a number for each row of the signals comes of what an effect remembers at many points.
+enum class Over { cells, facets, largest_of_facets };
+
+/// An integral over the lung, or over the surfaces, of what an effect remembers there, or the largest value on them
+/// (SignalRow::integrals).
 struct RememberedIntegral {
   std::string effect;
   std::size_t quantity; ///< number among those of the effect
-  PetscReal factor;     ///< of mm^3 times the quantity's unit
+  PetscReal factor;     ///< of mm^3, mm^2 or 1, times the quantity's unit
+  Over over = Over::cells;
+};
+
+/// The largest value of a column in @p rows.
+inline double largest(const SignalSpec &signal, const std::vector<SignalRow> &rows)
+{
+  double most = -std::numeric_limits<double>::infinity();
+  for (const SignalRow &row : rows) most = std::max(most, signal.value(row));
+  return most;
+}
+
+/// A column of the signals that should not rise above a limit.
+struct SignalLimit {
+  std::size_t signal; ///< number among Composition::signals()
+  double most;
+  std::string complaint; ///< what it means, and what to do: the end of a sentence
 };
 
 /// What one effect remembers there.
@@ -267,8 +288,14 @@ public:
   /// speaks remembers in the cells, times @p factor.
   void integrate(std::size_t quantity, const std::string &name, PetscReal factor)
   {
-    signal(name, [i = integrals_.size()](const SignalRow &row) { return row.integrals[i]; });
-    integrals_.push_back({effect_, quantity, factor});
+    signal(name, [i = sum_up(quantity, Over::cells, factor)](const SignalRow &row) { return row.integrals[i]; });
+  }
+  /// Which of SignalRow::integrals is quantity @p quantity @p over the places where the effect remembers it, times @p
+  /// factor.
+  std::size_t sum_up(std::size_t quantity, Over over, PetscReal factor)
+  {
+    integrals_.push_back({effect_, quantity, factor, over});
+    return integrals_.size() - 1;
   }
   const std::vector<RememberedIntegral> &integrals() const { return integrals_; }
   /// Scalars that are remembered at a point of a cell, or of a facet of @p surface.
@@ -294,6 +321,10 @@ public:
     signals_.push_back({name, std::move(value)});
   }
   const std::vector<SignalSpec> &signals() const { return signals_; }
+  /// The largest value that the last column had in the run stands in summary.json, and a run is told of one above
+  /// @p most.
+  void limit(double most, const std::string &complaint) { limits_.push_back({signals_.size() - 1, most, complaint}); }
+  const std::vector<SignalLimit> &limits() const { return limits_; }
   void constrain(Constraint c)
   {
     c.effect = effect_;
@@ -433,6 +464,7 @@ private:
   std::vector<ScalarGroup> scalar_groups_;
   std::vector<ScalarEnergyTerm> scalar_energies_;
   std::vector<SignalSpec> signals_;
+  std::vector<SignalLimit> limits_;
   std::size_t n_scalars_ = 0;
   std::shared_ptr<const ParameterFields> varying_;
 };
