@@ -493,15 +493,16 @@ PetscErrorCode check_held(MPI_Comm comm, const Composition &composition, PetscRe
       "nothing holds the lung in place: give -chest_wall (springs), or -support -support_rigid to let it move "
       "freely but for the six rigid-body motions");
   PetscCall(find_held(composition, held));
+  const char *wall = composition.surfaces_of("cavity").empty() ? "" : " (a wall holds nothing that it does not touch)";
   for (const HeldBody &one : held) {
     PulmoUserCheck(one.free.size() < n_motions, comm,
-                   "%s is held in place by nothing: name a surface of it with -chest_wall_surfaces or "
+                   "%s is held in place by nothing%s: name a surface of it with -chest_wall_surfaces or "
                    "-support_surfaces, or join the bodies in gmsh",
-                   mesh.body_text(one.body).c_str());
+                   mesh.body_text(one.body).c_str(), wall);
     PulmoUserCheck(one.free.empty(), comm,
-                   "%s is still free to move: %s; hold it with more surfaces or components (-support_surfaces, "
+                   "%s is still free to move%s: %s; hold it with more surfaces or components (-support_surfaces, "
                    "-chest_wall_surfaces), or give -support -support_rigid to pin just that",
-                   mesh.body_text(one.body).c_str(), describe(one, one.free).c_str());
+                   mesh.body_text(one.body).c_str(), wall, describe(one, one.free).c_str());
     bodies.push_back(one.body);
   }
   for (const HeldBody &one : held) {

@@ -3,6 +3,7 @@
 #include "pulmo/physics/effects/airflow.hpp"
 #include "pulmo/physics/effects/airway_tree.hpp"
 #include "pulmo/physics/effects/breathing_effort.hpp"
+#include "pulmo/physics/effects/cavity.hpp"
 #include "pulmo/physics/effects/chest_wall.hpp"
 #include "pulmo/physics/effects/gravity.hpp"
 #include "pulmo/physics/effects/lumen_pressure.hpp"
@@ -47,6 +48,7 @@ Registry Registry::standard()
   // effects beside tissue, airflow and ventilator
   r.effect<AirwayTree>();
   r.effect<BreathingEffort>();
+  r.effect<Cavity>();
   r.effect<ChestWall>();
   r.effect<Gravity>();
   r.effect<LumenPressure>();

@@ -60,6 +60,15 @@ def text_file(name, text):
     return path
 
 
+# a tetrahedron of 3 mm
+FACETS = [((0, 0, 0), (0, 3, 0), (3, 0, 0)), ((0, 0, 0), (3, 0, 0), (0, 0, 3)), ((3, 0, 0), (0, 3, 0), (0, 0, 3)), ((0, 0, 0), (0, 0, 3), (0, 3, 0))]
+
+
+def stl(facets):
+    text = "".join("facet normal 0 0 0 outer loop " + "".join("vertex %g %g %g " % x for x in t) + "endloop endfacet\n" for t in facets)
+    return ("solid wall\n" + text + "endsolid").encode()
+
+
 def meshes():
     """Name -> path of a spoilt mesh."""
     with open(pulmo.mesh("cube_lung.msh"), "rb") as f:
@@ -391,6 +400,25 @@ def table(m):
                                            ["'diaphragm'", "-support_surfaces", "airway, pleura"]),
         "unknown surface of the traction": (good + ["-traction", "-traction_surfaces", "x1"],
                                             ["'x1'", "-traction_surfaces", "airway, pleura"]),
+        "unknown surface of the cavity": (good + ["-cavity", "-cavity_surfaces", "chest"],
+                                          ["'chest'", "-cavity_surfaces", "airway, pleura"]),
+        "a cavity that is nowhere": (good + ["-cavity", "-cavity_file", "nowhere.stl"], ["-cavity_file nowhere.stl", "cannot be read"]),
+        "a cavity that is no mesh": (good + ["-cavity", "-cavity_file", m["text"]], ["-cavity_file", "not a readable mesh"]),
+        "a cavity that is text": (good + ["-cavity", "-cavity_file", text_file("words.stl", b"a wall, say\n" * 20)],
+                                  ["-cavity_file", "no readable STL file"]),
+        "a cavity with a hole": (good + ["-cavity", "-cavity_file", text_file("hole.stl", stl(FACETS[:-1]))],
+                                 ["-cavity_file", "no closed surface", "3 edges of one triangle alone", "close its holes"]),
+        "a cavity with a turned facet": (good + ["-cavity", "-cavity_file", text_file("turned.stl", stl(FACETS[:-1] + [FACETS[-1][::-1]]))],
+                                         ["-cavity_file", "run the same way", "orient"]),
+        "a lung outside of its cavity": (good + ["-cavity", "-cavity_file", text_file("small.stl", stl(FACETS))],
+                                         ["-cavity_file", "not within the cavity", "mm outside at rest", "-cavity_scale"]),
+        "a negative gap": (good + ["-cavity", "-cavity_gap", "-1"], ["-cavity_gap", "-1"]),
+        "a gap by cell": (good + ["-cavity"] + values("gap", np.ones(100), "-cavity_gap"), ["-cavity_gap", "parts of the mesh"]),
+        "a gap beside a file": (good + ["-cavity", "-cavity_file", text_file("with_gap.stl", stl(FACETS)), "-cavity_gap", "1"],
+                                ["-cavity_gap", "without -cavity_file"]),
+        "a gap beside tension": (good + ["-cavity", "-cavity_tension", "-cavity_gap", "1"], ["-cavity_gap", "-cavity_tension"]),
+        "too fine a wall": (good + ["-cavity", "-cavity_spacing", "1e-3"], ["-cavity_spacing", "nodes"]),
+        "a lung that only a wall holds": (good + ["-cavity", "-chest_wall", "off"], ["held in place by nothing", "does not touch"]),
         "a surface twice": (good + ["-chest_wall_surfaces", "pleura,pleura"], ["-chest_wall_surfaces", "'pleura' twice"]),
         "no surface in the list": (good + ["-airflow_surfaces", ","], ["-airflow_surfaces", "names nothing"]),
         # names of options
