@@ -195,6 +195,20 @@ double ClosedSurface::size() const
   return std::hypot(high[0] - low[0], high[1] - low[1], high[2] - low[2]);
 }
 
+std::string ClosedSurface::hash() const
+{
+  std::uint64_t h = 0xcbf29ce484222325U; // FNV-1a
+  const auto add = [&h](const void *data, std::size_t bytes) {
+    const auto *byte = static_cast<const unsigned char *>(data);
+    for (std::size_t i = 0; i < bytes; ++i) h = (h ^ byte[i]) * 0x100000001b3U;
+  };
+  add(nodes.data(), nodes.size() * sizeof(nodes[0]));
+  add(triangles.data(), triangles.size() * sizeof(triangles[0]));
+  char text[32];
+  std::snprintf(text, sizeof(text), "hash %016llx", static_cast<unsigned long long>(h));
+  return text;
+}
+
 std::string join_triangles(std::vector<Corners> list, ClosedSurface &surface)
 {
   std::map<Place, int> number;

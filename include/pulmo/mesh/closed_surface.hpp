@@ -26,6 +26,8 @@ struct ClosedSurface {
   Place highest() const;
   /// Diagonal of that box.
   double size() const;
+  /// "hash ...", the same for the same triangles.
+  std::string hash() const;
 };
 
 /// Joins triangles where their corners are the same numbers. Returns what is wrong with them, as the words that follow

@@ -134,25 +134,23 @@ public:
     PetscCall(options.real("scale", "-", Range::positive(), "that makes the file's coordinates mm", scale_));
     options.group(name(), "one-sided contact", on_ && !tension_, "-cavity without -cavity_tension");
     PetscCall(options.real("onset", "mm", Range::positive(), "penetration over which the stiffness comes", k.onset));
+    if (!on_ || file_.empty()) PetscFunctionReturn(PETSC_SUCCESS);
+    PetscCall(read_closed_surface(options.comm(), "-cavity_file", file_, scale_, surface_));
+    options.note_content("-cavity_file", "a closed surface, " + surface_.hash());
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
   PetscErrorCode check(const Options &options, const Mesh &mesh, const SceneFacts &) override
   {
-    ClosedSurface surface;
-
     PetscFunctionBeginUser;
     PulmoUserCheck(!surfaces_.empty(), options.comm(), "-cavity needs -cavity_surfaces NAME,...");
     PetscCall(mesh.require_surfaces(surfaces_, "-cavity_surfaces"));
-    if (file_.empty())
-      PetscCall(boundary_of(mesh, "-cavity", surface));
-    else
-      PetscCall(read_closed_surface(options.comm(), "-cavity_file", file_, scale_, surface));
+    if (file_.empty()) PetscCall(boundary_of(mesh, "-cavity", surface_));
     for (const Options::Varying &v : options.varying())
       PulmoUserCheck(v.target != &parameters_.gap || !v.by_cell, options.comm(),
                      "-cavity_gap takes no values by cell: the wall is a surface; name parts of the mesh instead "
                      "(-cavity_gap 5,left_lung=8)");
-    PetscCall(build(options, surface));
+    PetscCall(build(options));
     if (!file_.empty())
       PetscCall(check_inside(options, mesh));
     else if (!tension_)
@@ -211,23 +209,23 @@ private:
     return gap;
   }
 
-  PetscErrorCode build(const Options &options, const ClosedSurface &surface)
+  PetscErrorCode build(const Options &options)
   {
     constexpr PetscReal share = 1. / 128; // of the cavity's size
     constexpr double share_lost = 0.05;   // of a spacing
     constexpr int margin = 8;             // spacings beyond the wall, for states on the way to a solution
-    const PetscReal spacing = spacing_ > 0 ? spacing_ : share * surface.size(),
+    const PetscReal spacing = spacing_ > 0 ? spacing_ : share * surface_.size(),
                     reach = largest_gap(options) + margin * spacing,
-                    nodes = SignedDistance::nodes(surface, spacing, reach);
+                    nodes = SignedDistance::nodes(surface_, spacing, reach);
 
     PetscFunctionBeginUser;
     PulmoUserCheck(
         nodes <= SignedDistance::most_nodes, options.comm(),
         "-cavity: a grid of %.3g mm around a cavity of %.3g mm and a gap of %.3g mm has %.2g nodes, more than "
         "%.2g; give a larger -cavity_spacing, or a smaller -cavity_gap",
-        (double)spacing, surface.size(), (double)largest_gap(options), (double)nodes, SignedDistance::most_nodes);
-    wall_.build(surface, spacing, reach);
-    const double departure = wall_.departure(surface);
+        (double)spacing, surface_.size(), (double)largest_gap(options), (double)nodes, SignedDistance::most_nodes);
+    wall_.build(surface_, spacing, reach);
+    const double departure = wall_.departure(surface_);
     if (departure > share_lost * spacing)
       PetscCall(PetscPrintf(options.comm(),
                             "pulmo: warning: -cavity: the wall is smoother than the surface it is made of, by %.3g mm "
@@ -316,6 +314,7 @@ private:
   std::vector<std::string> surfaces_{"pleura"};
   std::string file_;
   PetscReal spacing_ = 0, scale_ = 1;
+  ClosedSurface surface_; ///< that the wall is made of
   SignedDistance wall_;
   mutable CavityKernels::Parameters parameters_;
 };
