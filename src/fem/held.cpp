@@ -510,11 +510,14 @@ PetscErrorCode check_held(MPI_Comm comm, const Composition &composition, PetscRe
     const PetscReal share = one.weakest_stiffness / one.largest_stiffness;
     const PetscReal against_tissue = one.weakest_stiffness / (modulus * one.size);
     if (share < barely)
-      PetscCall(PetscPrintf(comm,
-                            "pulmo: warning: springs hold %s barely against %s: by %.2g of what they hold best; if "
-                            "that is a surface of revolution, only the facets of its mesh do: a load that way moves it "
-                            "far; hold it with -support, or with springs in full (-chest_wall_direction full)\n",
-                            mesh.body_text(one.body).c_str(), describe(one, {one.weakest}).c_str(), (double)share));
+      PetscCall(
+          PetscPrintf(comm,
+                      "pulmo: warning: springs hold %s barely against %s: by %.2g of what they hold best (smallest "
+                      "eigenvalue %.3g kPa mm); if that is a surface of revolution, only the facets of its mesh "
+                      "do: a load that way moves it far; hold it with -support, or with springs in full "
+                      "(-chest_wall_direction full)\n",
+                      mesh.body_text(one.body).c_str(), describe(one, {one.weakest}).c_str(), (double)share,
+                      (double)one.weakest_stiffness));
     else if (against_tissue < hardly_regular)
       PetscCall(PetscPrintf(comm,
                             "pulmo: warning: springs hold %s %.2g times as stiffly as its tissue does: the equations "

@@ -323,6 +323,34 @@ TEST(LumenPressure, WallTraction)
   });
 }
 
+/// The normal of the deformed surface, F^-T N.
+std::array<double, 3> turned_normal(const Data &d)
+{
+  const Tensor back = inverse(d.F());
+  std::array<double, 3> n{};
+  for (int i = 0; i < 3; ++i)
+    for (int J = 0; J < 3; ++J) n[i] += back[3 * J + i] * d.normal[J];
+  const double length = std::sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2]);
+  for (double &component : n) component /= length;
+  return n;
+}
+
+/// The displacement that a spring resists.
+std::array<double, 3> resisted(const Data &d, int direction)
+{
+  using K = ChestWallKernels;
+  std::array<double, 3> n{d.normal[0], d.normal[1], d.normal[2]};
+  if (direction == K::full) return {d.u[0], d.u[1], d.u[2]};
+  if (direction == K::current_normal) n = turned_normal(d);
+  const double u_n = d.u[0] * n[0] + d.u[1] * n[1] + d.u[2] * n[2];
+  return {u_n * n[0], u_n * n[1], u_n * n[2]};
+}
+
+double length_of(const std::array<double, 3> &v)
+{
+  return std::sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]);
+}
+
 TEST(ChestWall, SpringsResistTheVectorOrItsNormalPart)
 {
   using K = ChestWallKernels;
@@ -330,18 +358,119 @@ TEST(ChestWall, SpringsResistTheVectorOrItsNormalPart)
     K::Parameters k{};
     k.stiffness[0] = 0.08;
     k.stiffness[3] = 0.5;
-    for (double normal_only : {0.0, 1.0}) {
-      k.normal_only = normal_only;
-      const double u_N = d.u[0] * d.normal[0] + d.u[1] * d.normal[1] + d.u[2] * d.normal[2];
+    k.stiffening[3] = 0.7;
+    for (int direction : {K::full, K::normal, K::current_normal}) {
+      k.direction = direction;
       const auto first = d.call<K::Parameters>(K::spring<0>, k, 3), fourth = d.call<K::Parameters>(K::spring<3>, k, 3);
-      for (int i = 0; i < 3; ++i) {
-        const double resisted = normal_only != 0 ? u_N * d.normal[i] : d.u[i];
-        EXPECT_NEAR(first[i], 0.08 * resisted, 1e-15 * 4); // minus the traction -K_s u
-        EXPECT_NEAR(fourth[i], 0.5 * resisted, 1e-15 * 4);
+      const auto way = resisted(d, direction);
+      for (int i = 0; i < 3; ++i) { // minus the traction -K_s (1 + s |d|) d
+        EXPECT_NEAR(first[i], 0.08 * way[i], 1e-14);
+        EXPECT_NEAR(fourth[i], 0.5 * (1 + 0.7 * length_of(way)) * way[i], 1e-14);
       }
       expect_derivative<K::Parameters>(d, K::spring<0>, K::spring_tangent<0>, k, 3, 3, move_u, three);
       expect_derivative<K::Parameters>(d, K::spring<3>, K::spring_tangent<3>, k, 3, 3, move_u, three);
+      if (direction != K::current_normal) continue;
+      expect_derivative<K::Parameters>(d, K::spring<0>, K::spring_turns<0>, k, 3, 9, move_H, nine);
+      expect_derivative<K::Parameters>(d, K::spring<3>, K::spring_turns<3>, k, 3, 9, move_H, nine);
     }
+  });
+}
+
+TEST(ChestWall, WhatSpringsStoreAndTurningDoesIsTheirWork)
+{
+  using K = ChestWallKernels;
+  Random random(47);
+  at_points([&](const Data &end) {
+    Data start = end;
+    for (int i = 0; i < 9; ++i) start.H[i] += 0.1 * random();
+    for (double &u : start.u) u += 0.3 * random();
+    const double K_s = 0.5, s = 0.7;
+    K::Parameters k{};
+    k.stiffness[3] = K_s;
+    k.stiffening[3] = s;
+    for (int direction : {K::full, K::normal, K::current_normal}) {
+      k.direction = direction;
+      // the path from start to end in n steps
+      const auto at = [&](int i, int n) {
+        Data d = end;
+        const double share = static_cast<double>(i) / n;
+        for (int j = 0; j < 9; ++j) d.H[j] = start.H[j] + share * (end.H[j] - start.H[j]);
+        for (int j = 0; j < 3; ++j) d.u[j] = start.u[j] + share * (end.u[j] - start.u[j]);
+        return d;
+      };
+      const auto follow = [&](int n, double sums[3]) {
+        for (int i = 1; i <= n; ++i) {
+          Data a = at(i - 1, n), b = at(i, n);
+          PointState state_a, state_b;
+          make_point_state(a.H.data(), nullptr, state_a);
+          make_point_state(b.H.data(), nullptr, state_b);
+          const Point before{state_a, a.u, 0, nullptr, 0, 0, a.x, a.normal, Step()},
+              now{state_b, b.u, 0, nullptr, 0, 0, b.x, b.normal, Step()};
+          const auto f = b.call<K::Parameters>(K::spring<3>, k, 3);
+          double work = 0;
+          for (int j = 0; j < 3; ++j) work += f[j] * (b.u[j] - a.u[j]);
+          const double stored = K::stored<3>(now, before, k), turning = K::turning<3>(now, before, k),
+                       lost = K::numerical<3>(now, before, k);
+          EXPECT_NEAR(work, stored - turning + lost, 1e-14);
+          sums[0] += stored;
+          sums[1] += turning;
+          sums[2] += lost;
+        }
+      };
+      const auto energy = [&](const Data &d) {
+        const double a = length_of(resisted(d, direction));
+        return K_s * (a * a / 2 + s * a * a * a / 3);
+      };
+      // int g u . dn by Simpson's rule, with dn/dF . dF by differences of its own
+      const auto turns = [&](double share) {
+        const auto on_path = [&](double x) {
+          Data d = end;
+          for (int j = 0; j < 9; ++j) d.H[j] = start.H[j] + x * (end.H[j] - start.H[j]);
+          for (int j = 0; j < 3; ++j) d.u[j] = start.u[j] + x * (end.u[j] - start.u[j]);
+          return d;
+        };
+        const double h = 1e-4;
+        const auto ahead = turned_normal(on_path(share + h)), behind = turned_normal(on_path(share - h));
+        const Data d = on_path(share);
+        const auto n = turned_normal(d);
+        double u_n = 0, u_dn = 0;
+        for (int j = 0; j < 3; ++j) {
+          u_n += d.u[j] * n[j];
+          u_dn += d.u[j] * (ahead[j] - behind[j]) / (2 * h);
+        }
+        return K_s * (1 + s * std::abs(u_n)) * u_n * u_dn;
+      };
+      double expected = 0, once[3] = {0, 0, 0}, coarse[3] = {0, 0, 0}, fine[3] = {0, 0, 0};
+      const int n = 200;
+      if (direction == K::current_normal)
+        for (int i = 0; i <= n; ++i)
+          expected += (i == 0 || i == n ? 1 : i % 2 ? 4 : 2) * turns(i / double(n)) / (3 * n);
+      follow(1, once);
+      follow(50, coarse);
+      follow(100, fine);
+      const double grown = energy(end) - energy(start);
+      EXPECT_NEAR(once[0], grown, 1e-13);
+      EXPECT_NEAR(fine[0], grown, 1e-12);
+      EXPECT_NEAR(fine[1], expected, 2e-4 * (std::abs(expected) + 1e-6));
+      EXPECT_NEAR(fine[2], coarse[2] / 2, 0.03 * std::abs(coarse[2]) + 1e-9); // backward Euler: of the step's order
+    }
+  });
+}
+
+TEST(ChestWall, TheOffsetIsASuctionThatFollows)
+{
+  using K = ChestWallKernels;
+  at_points([](Data d) {
+    K::Parameters k{};
+    k.offset[2] = 5;
+    d.step.load = 0.75;
+    const auto f0 = d.call<K::Parameters>(K::pull<2>, k, 3);
+    for (int i = 0; i < 3; ++i) {
+      double cof_N = 0;
+      for (int J = 0; J < 3; ++J) cof_N += d.cof()[3 * i + J] * d.normal[J];
+      EXPECT_NEAR(f0[i], -0.75 * 5 * 0.0980665 * cof_N, 1e-12); // minus a traction outward
+    }
+    expect_derivative<K::Parameters>(d, K::pull<2>, K::pull_by_displacement<2>, k, 3, 9, move_H, nine);
   });
 }
 

@@ -58,6 +58,11 @@ std::vector<Case> cases()
   list.push_back({"paper's traction", breath + gas + springs});
   list.push_back(
       {"normal springs", breath + gas + springs + "-chest_wall_direction normal -chest_wall_surfaces pleura "});
+  list.push_back(
+      {"springs that turn, stiffen and pull", breath + gas + springs +
+                                                  "-chest_wall_direction current_normal -chest_wall_surfaces "
+                                                  "pleura -chest_wall_stiffening 2 -chest_wall_offset 3 "});
+  list.push_back({"springs that stiffen", breath + gas + springs + "-chest_wall_stiffening 2 "});
   list.push_back({"no springs", breath + gas + "-support -support_rigid "});
   list.push_back({"damped pressure", breath + gas + springs + "-pressure_damping "});
   list.push_back({"no airflow", breath + springs});
@@ -108,7 +113,7 @@ TEST(EnergyBalance, ClosesWhateverTheStepAndTheScene)
       const std::size_t middle = a.audit.rows().size() / 2;
       EXPECT_GT(a("elastic_tissue", a.audit.rows()[middle]), 0) << c.name;
       EXPECT_EQ(a("elastic_springs", a.audit.rows()[middle]) > 0, has("-chest_wall")) << c.name;
-      EXPECT_EQ(a("external") != 0, has("-lumen_pressure") || has("-traction")) << c.name;
+      EXPECT_EQ(a("external") != 0, has("-lumen_pressure") || has("-traction") || has("_offset")) << c.name;
       EXPECT_GT(a("numerical_dissipation"), 1e-4 * scale) << c.name;
       EXPECT_EQ(a("resistive_tube"), 0);
     }
