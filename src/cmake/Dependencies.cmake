@@ -38,6 +38,20 @@ endmacro()
 find_petsc_package(METIS metis.h metis)
 find_petsc_package(HDF5 hdf5.h hdf5 hdf5_openmpi)
 
+# expressions of users; only pulmo's own sources see its headers
+find_path(MUPARSER_INCLUDE_DIR muParser.h)
+find_library(MUPARSER_LIBRARY muparser)
+mark_as_advanced(MUPARSER_INCLUDE_DIR MUPARSER_LIBRARY)
+if(NOT MUPARSER_INCLUDE_DIR OR NOT MUPARSER_LIBRARY)
+  message(FATAL_ERROR "pulmo needs muparser (Debian: libmuparser-dev); where it stands elsewhere, set MUPARSER_INCLUDE_DIR "
+                      "(the folder of muParser.h) and MUPARSER_LIBRARY.")
+endif()
+if(NOT TARGET pulmo::muparser)
+  add_library(pulmo::muparser INTERFACE IMPORTED GLOBAL)
+  set_target_properties(pulmo::muparser PROPERTIES INTERFACE_LINK_LIBRARIES "${MUPARSER_LIBRARY}"
+                                                   INTERFACE_INCLUDE_DIRECTORIES "${MUPARSER_INCLUDE_DIR}")
+endif()
+
 # one MPI for all: PETSc's headers know theirs, HDF5's must be parallel
 if(NOT PULMO_CHECKED_LIBRARIES)
   set(source ${CMAKE_BINARY_DIR}/CMakeFiles/pulmo_libraries.cpp)

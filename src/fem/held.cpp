@@ -587,7 +587,7 @@ PetscErrorCode check_prescribed_once(const Composition &composition)
           constraint.value(t, x, mine);
           constraints[other].value(t, x, theirs);
           const double difference = std::abs(mine[c] - theirs[c]);
-          if (difference <= rounding * std::max(std::abs(mine[c]), std::abs(theirs[c])) ||
+          if (!(difference > rounding * std::max(std::abs(mine[c]), std::abs(theirs[c]))) || // or not a number
               difference <= worst.difference)
             continue;
           worst.difference = difference;

@@ -546,6 +546,44 @@ PetscErrorCode Options::vector(const std::string &name, const std::string &unit,
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode Options::expressions(const std::string &name, const std::string &unit, const std::string &help,
+                                    std::vector<Expression> &value)
+{
+  std::string raw, text;
+  bool is_given;
+  std::vector<std::pair<std::size_t, std::size_t>> parts; // begin and end
+  std::size_t begin = 0;
+  int depth = 0;
+
+  PetscFunctionBeginUser;
+  for (const Expression &e : value) text += (text.empty() ? "" : ",") + e.text();
+  PetscCall(find(name, text, unit, "", help, raw, is_given));
+  if (!is_given) PetscFunctionReturn(PETSC_SUCCESS);
+  for (std::size_t i = 0; i <= raw.size(); ++i) { // commas between parentheses are those of functions
+    if (i < raw.size() && raw[i] == '(') ++depth;
+    if (i < raw.size() && raw[i] == ')') --depth;
+    if (i < raw.size() && (raw[i] != ',' || depth > 0)) continue;
+    const std::size_t first = std::min(raw.find_first_not_of(" \t", begin), i),
+                      last = i > first ? raw.find_last_not_of(" \t", i - 1) + 1 : first;
+    parts.emplace_back(first, last);
+    begin = i + 1;
+  }
+  PulmoUserCheck(depth <= 0, comm_, "option %s '%s' is wrong at column %d: a parenthesis is not closed",
+                 full(name).c_str(), raw.c_str(), static_cast<int>(raw.size() + 1));
+  PulmoUserCheck(parts.size() == value.size(), comm_, "option %s takes %s (%s)%s, not '%s'%s", full(name).c_str(),
+                 value.size() == 3 ? "three numbers or expressions of x, y, z, t" : "a number or an expression of t",
+                 unit.c_str(), value.size() == 3 ? " separated by commas" : "", raw.c_str(),
+                 raw.empty() ? " (what begins with a minus and a letter is taken for an option: write (-x))" : "");
+  for (std::size_t d = 0; d < value.size(); ++d) {
+    std::string fault;
+    std::size_t column;
+    value[d] = Expression::read(raw.substr(parts[d].first, parts[d].second - parts[d].first), fault, column);
+    PulmoUserCheck(fault.empty(), comm_, "option %s '%s' is wrong at column %d: %s", full(name).c_str(), raw.c_str(),
+                   static_cast<int>(parts[d].first + column), fault.c_str());
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 void Options::tolerate(const std::string &name)
 {
   for (Declared &d : declared_) d.tolerated = d.tolerated || d.name == full(name);

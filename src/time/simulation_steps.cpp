@@ -97,6 +97,15 @@ PetscErrorCode Simulation::after_stage()
   PetscCall(SNESGetConvergedReason(snes, &reason));
   newton_ += newton;
   krylov_ += krylov;
+  for (Partner *partner : partners_) {
+    std::string why;
+    PetscCall(partner->give_up(why));
+    if (!why.empty() && unsolved_.empty()) unsolved_ = why + ".";
+  }
+  if (!unsolved_.empty()) {
+    PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
   if (rows_.size() == 1 && newton == 0 && reason == SNES_CONVERGED_FNORM_ABS) PetscCall(warn_of_faint_load(snes));
   if (reason < 0) {
     PetscReal dt;
@@ -137,7 +146,7 @@ PetscErrorCode Simulation::accept_stage(PetscReal t, Vec X, PetscBool *accept)
   *accept = PETSC_FALSE;
   PetscCall(TSGetSNES(ts_, &snes));
   PetscCall(SNESGetConvergedReason(snes, &reason));
-  if (reason < 0)
+  if (reason < 0 || !unsolved_.empty())
     PetscFunctionReturn(PETSC_SUCCESS); // newer PETSc asks here before it looks; after_stage() dealt with it
   PetscCall(TSGetTimeStep(ts_, &dt));
   PetscCall(airway_.apply(X));

@@ -4,6 +4,7 @@
 #pragma once
 
 #include "pulmo/base/petsc.hpp"
+#include "pulmo/input/expression.hpp"
 
 #include <limits>
 #include <map>
@@ -68,6 +69,10 @@ public:
                        PetscReal value[], std::size_t most, std::size_t &n);
   /// Three numbers separated by commas.
   PetscErrorCode vector(const std::string &name, const std::string &unit, const std::string &help, PetscReal value[3]);
+
+  /// Numbers or expressions separated by commas, as many as @p value has.
+  PetscErrorCode expressions(const std::string &name, const std::string &unit, const std::string &help,
+                             std::vector<Expression> &value);
 
   /// A number that was given with others for parts of the mesh.
   struct Varying {

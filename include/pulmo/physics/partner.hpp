@@ -47,6 +47,9 @@ public:
   virtual Verdict judge(const Attempt &) { return Verdict::accept; }
   /// Why it asked for a shorter step; half a sentence.
   virtual std::string why() const { return ""; }
+  /// Asked when equations were solved, or could not be: a sentence, without its full stop, on why the run must end
+  /// here, the same on all ranks; or nothing.
+  virtual PetscErrorCode give_up(std::string &) { return PETSC_SUCCESS; }
   /// The attempt at hand is not accepted, for whatever reason: @p how, again or shorter.
   virtual void reject(Verdict) {}
   virtual void accept(const Attempt &) {}

@@ -11,6 +11,7 @@
 #include "pulmo/mesh/mesh.hpp"
 #include "pulmo/physics/effect.hpp"
 #include "pulmo/physics/follower_pressure.hpp"
+#include "pulmo/physics/load_expression.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -21,20 +22,23 @@ namespace pulmo {
 struct EffortCourse {
   PetscReal amplitude = 5, rise = 0.8, hold = 0.1, fall = 0.3, period = 4, delay = 0; ///< cmH2O, s
   std::vector<PetscReal> times, pressures; ///< of a file, s and cmH2O: linear between, repeated; empty: pulses
+  bool expressed = false;
+  LoadExpression expression; ///< in their place
   const SceneFacts *facts = nullptr;
 
   /// The clock starts where a phase `settle` at the start of the run ends, s.
-  PetscReal start() const
-  {
-    if (!facts || !facts->ventilator) return delay;
-    const Phase &first = facts->ventilator->phases().front();
-    return delay + (first.name == "settle" && first.breath == 0 ? first.end : 0);
-  }
+  PetscReal start() const { return delay + (facts ? end_of_settling(*facts) : 0); }
   /// cmH2O at time @p t of the run.
   PetscReal at(PetscReal t) const
   {
     const PetscReal since = t - start();
     if (since <= 0) return 0;
+    if (expressed) {
+      constexpr PetscReal nowhere[3] = {0, 0, 0};
+      PetscScalar value;
+      expression.at(since, nowhere, &value);
+      return value;
+    }
     return times.empty() ? pulse(std::fmod(since, period)) : listed(std::fmod(since, times.back()));
   }
 
@@ -106,18 +110,36 @@ public:
                            "table (CSV) time_s,pressure_cmH2O, linear between its rows and repeated; instead "
                            "of pulses",
                            file_));
+    std::vector<Expression> course(1);
+    bool given;
+    PetscCall(options.expressions("course", "cmH2O",
+                                  "suction as an expression of t (s, from the first effort on); instead of "
+                                  "pulses",
+                                  course));
+    PetscCall(options.given("course", given));
     PetscCall(options.real("delay", "s", Range::not_negative(),
                            "time of rest before the first effort (after a phase 'settle' at the start)",
                            course_.delay));
-    options.group(name(), "pulses", on_ && file_.empty(), "-breathing_effort without -breathing_effort_file");
+    course_.expressed = given;
+    course_.expression.option = "-breathing_effort_course";
+    course_.expression.values = course;
+    course_.expression.range = Range::not_negative();
+    options.group(name(), "pulses", on_ && file_.empty() && !given,
+                  "-breathing_effort without -breathing_effort_file and -breathing_effort_course");
     PetscCall(options.real("pressure", "cmH2O", Range::not_negative(), "suction while it is held", course_.amplitude));
     PetscCall(options.real("rise", "s", Range::positive(), "time of its rise (raised cosine)", course_.rise));
     PetscCall(options.real("hold", "s", Range::not_negative(), "time that it is held", course_.hold));
     PetscCall(options.real("fall", "s", Range::positive(), "time of its fall (raised cosine)", course_.fall));
     PetscCall(options.real("period", "s", Range::positive(), "from one effort to the next", course_.period));
     if (!on_) PetscFunctionReturn(PETSC_SUCCESS);
+    comm_ = options.comm();
+    PulmoUserCheck(file_.empty() || !given, options.comm(),
+                   "-breathing_effort_file and -breathing_effort_course both tell the course of the suction; leave one "
+                   "out");
     if (!file_.empty()) PetscCall(read(options));
-    PulmoUserCheck(!file_.empty() || course_.rise + course_.hold + course_.fall <= course_.period, options.comm(),
+    if (given) PetscCall(check_course(options.comm()));
+    PulmoUserCheck(!file_.empty() || given || course_.rise + course_.hold + course_.fall <= course_.period,
+                   options.comm(),
                    "-breathing_effort_period %g s is shorter than rise, hold and fall together, %g s; give a longer "
                    "period",
                    (double)course_.period, (double)(course_.rise + course_.hold + course_.fall));
@@ -184,7 +206,31 @@ public:
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
+  std::vector<std::unique_ptr<Partner>> partners(const SceneFacts &) const override
+  {
+    if (!course_.expressed) return {};
+    return LoadWatch::over(name(), comm_, {&course_.expression});
+  }
+
 private:
+  PetscErrorCode check_course(MPI_Comm comm) const
+  {
+    constexpr PetscReal nowhere[3] = {0, 0, 0}, rest = 1e-6; // cmH2O
+    const Expression &course = course_.expression.values.front();
+    const PetscReal first = course.at(0, nowhere);
+
+    PetscFunctionBeginUser;
+    PulmoUserCheck(!course.of_place(), comm,
+                   "-breathing_effort_course '%s' depends on x, y or z; the suction is the same all over the surface: "
+                   "give an expression of t alone",
+                   course.text().c_str());
+    PulmoUserCheck(
+        std::abs(first) <= rest, comm,
+        "-breathing_effort_course '%s' is %g cmH2O at t = 0; the effort begins from rest: it must be 0 there",
+        course.text().c_str(), (double)first);
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
   PetscErrorCode read(Options &options)
   {
     Csv table;
@@ -216,6 +262,7 @@ private:
   bool on_ = false;
   std::vector<std::string> surfaces_{"pleura"};
   std::string file_;
+  MPI_Comm comm_ = MPI_COMM_NULL;
   mutable EffortCourse course_;
   mutable BreathingEffortKernels::Parameters parameters_;
 };

@@ -1,10 +1,12 @@
 /// @file
 /// Effect `support`: prescribed displacement components on surfaces, and pins of single vertices against the rigid
-/// motions that nothing else holds (a lung without springs, K_s = 0: all six of each body).
+/// motions that nothing else holds (a lung without springs, K_s = 0: all six of each body). Displacements may be
+/// expressions of x, y, z and t (load_expression.hpp).
 #pragma once
 
 #include "pulmo/mesh/mesh.hpp"
 #include "pulmo/physics/effect.hpp"
+#include "pulmo/physics/load_expression.hpp"
 
 #include <array>
 
@@ -31,13 +33,17 @@ public:
     for (const std::string &surface : surfaces_) {
       Held held;
       PetscCall(options.text("components_" + surface, "which components, of x, y and z, e.g. xz", held.components));
-      PetscCall(
-          options.vector("displacement_" + surface, "mm", "their values on surface " + surface, held.value.data()));
+      held.load.option = "-support_displacement_" + surface;
+      held.load.values.resize(3);
+      PetscCall(options.expressions(
+          "displacement_" + surface, "mm",
+          "their values on surface " + surface + "; numbers, or expressions of x, y, z (mm), t (s)", held.load.values));
       PulmoUserCheck(!held.components.empty() && held.components.find_first_not_of("xyz") == std::string::npos,
                      options.comm(), "-support_components_%s '%s' is not made of the letters x, y and z",
                      surface.c_str(), held.components.c_str());
       held_.push_back(held);
     }
+    comm_ = options.comm();
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
@@ -47,19 +53,24 @@ public:
     PulmoUserCheck(rigid_ || !surfaces_.empty(), options.comm(),
                    "-support holds nothing: give -support_surfaces NAME,... or -support_rigid");
     PetscCall(mesh.require_surfaces(surfaces_, "-support_surfaces"));
-    for (std::size_t i = 0; i < surfaces_.size(); ++i)
-      for (int d = 0; d < 3; ++d)
-        if (held_[i].value[d] != 0 && !held_[i].holds(d))
-          PetscCall(PetscPrintf(options.comm(),
-                                "pulmo: warning: -support_displacement_%s gives %.6g mm along %c, which "
-                                "-support_components_%s %s does not hold: it is not used; add the component, or leave "
-                                "its value 0\n",
-                                surfaces_[i].c_str(), (double)held_[i].value[d], "xyz"[d], surfaces_[i].c_str(),
-                                held_[i].components.c_str()));
+    for (std::size_t i = 0; i < surfaces_.size(); ++i) {
+      for (int d = 0; d < 3; ++d) {
+        Expression &value = held_[i].load.values[d];
+        if (held_[i].holds(d) || (value.constant() && value.at(0, nullptr) == 0)) continue;
+        PetscCall(PetscPrintf(options.comm(),
+                              "pulmo: warning: -support_displacement_%s gives %s mm along %c, which "
+                              "-support_components_%s %s does not hold: it is not used; add the component, or leave "
+                              "its value 0\n",
+                              surfaces_[i].c_str(), value.text().c_str(), "xyz"[d], surfaces_[i].c_str(),
+                              held_[i].components.c_str()));
+        value = 0;
+      }
+      PetscCall(check_start(mesh, {surfaces_[i]}, held_[i].load));
+    }
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
-  PetscErrorCode terms(Composition &c, const SceneFacts &) const override
+  PetscErrorCode terms(Composition &c, const SceneFacts &facts) const override
   {
     PetscFunctionBeginUser;
     for (std::size_t i = 0; i < surfaces_.size(); ++i) {
@@ -67,9 +78,9 @@ public:
       hold.name = "u on " + surfaces_[i];
       hold.surface = surfaces_[i];
       for (int d = 0; d < 3; ++d) hold.component[d] = held_[i].holds(d);
-      const std::array<PetscReal, 3> v = held_[i].value;
-      hold.value = [v](PetscReal, const PetscReal[3], PetscScalar u[3]) {
-        for (int d = 0; d < 3; ++d) u[d] = v[d];
+      held_[i].load.facts = &facts;
+      hold.value = [load = &std::as_const(held_[i].load)](PetscReal t, const PetscReal x[3], PetscScalar u[3]) {
+        load->at(t, x, u);
       };
       c.constrain(hold);
     }
@@ -77,17 +88,25 @@ public:
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
+  std::vector<std::unique_ptr<Partner>> partners(const SceneFacts &) const override
+  {
+    std::vector<const LoadExpression *> loads;
+    for (const Held &held : held_) loads.push_back(&held.load);
+    return LoadWatch::over(name(), comm_, loads);
+  }
+
 private:
   struct Held {
     std::string components = "xyz";
-    std::array<PetscReal, 3> value{0, 0, 0};
+    LoadExpression load; ///< prescribed displacement, mm
 
     bool holds(int d) const { return components.find("xyz"[d]) != std::string::npos; }
   };
 
   bool on_ = false, rigid_ = false;
   std::vector<std::string> surfaces_;
-  std::vector<Held> held_;
+  mutable std::vector<Held> held_;
+  MPI_Comm comm_ = MPI_COMM_NULL;
 };
 
 } // namespace pulmo

@@ -1,10 +1,12 @@
 /// @file
 /// Effect `traction`: dead load (kPa per reference area, fixed direction) on named surfaces, held from t = 0 on. Where
-/// the first step of a run has to be cut the load is cut with it.
+/// the first step of a run has to be cut the load is cut with it. Its components may be expressions of x, y, z and t
+/// (load_expression.hpp).
 #pragma once
 
 #include "pulmo/mesh/mesh.hpp"
 #include "pulmo/physics/effect.hpp"
+#include "pulmo/physics/load_expression.hpp"
 
 #include <array>
 #include <utility>
@@ -35,15 +37,43 @@ struct TractionKernels {
     return sum;
   }
 
-  template <std::size_t... I>
-  static constexpr std::array<Callback<PetscBdPointFunc>, sizeof...(I)> residuals(std::index_sequence<I...>)
+  /// The same for expressions.
+  struct Expressions {
+    static constexpr const char *owner = "traction_expressions";
+    PetscScalar load[max_surfaces]; ///< const LoadExpression *, as constants::to_scalar() packs it; of numbers: 0
+  };
+
+  template <std::size_t I>
+  static void expressed(const Point &point, const Expressions &k, PetscScalar T[3])
   {
-    return {surface_residual<Parameters, load<I>>...};
+    constants::to_pointer<const LoadExpression *>(k.load[I])->at(point.t, point.x, T);
   }
-  template <std::size_t... I>
-  static constexpr std::array<Callback<EnergyDensity>, sizeof...(I)> works(std::index_sequence<I...>)
+  template <std::size_t I>
+  static void expressed_load(const Point &point, const Expressions &k, PetscScalar f0[])
   {
-    return {energy_density<Parameters, work<I>>...};
+    PetscScalar T[3];
+    expressed<I>(point, k, T);
+    for (int i = 0; i < 3; ++i) f0[i] -= point.step.load * T[i];
+  }
+  template <std::size_t I>
+  static PetscScalar expressed_work(const Point &now, const Point &before, const Expressions &k)
+  {
+    PetscScalar T[3], sum = 0;
+    expressed<I>(now, k, T);
+    for (int i = 0; i < 3; ++i) sum += now.step.load * T[i] * (now.u[i] - before.u[i]);
+    return sum;
+  }
+
+  /// The callbacks of one surface.
+  struct Callbacks {
+    Callback<PetscBdPointFunc> load, expressed_load;
+    Callback<EnergyDensity> work, expressed_work;
+  };
+  template <std::size_t... I>
+  static constexpr std::array<Callbacks, sizeof...(I)> callbacks(std::index_sequence<I...>)
+  {
+    return {Callbacks{surface_residual<Parameters, load<I>>, surface_residual<Expressions, expressed_load<I>>,
+                      energy_density<Parameters, work<I>>, energy_density<Expressions, expressed_work<I>>}...};
   }
 };
 
@@ -56,22 +86,29 @@ public:
 
   PetscErrorCode declare(Options &options) override
   {
-    PetscReal common[3] = {0, 0, 0};
+    std::vector<Expression> common(3);
 
     PetscFunctionBeginUser;
     options.group(name(), about());
     PetscCall(options.flag("", "dead load on surfaces", on_));
     options.group(name(), about(), on_, "-traction");
     PetscCall(options.names("surfaces", "loaded surfaces", surfaces_));
-    PetscCall(options.vector("value", "kPa", "traction per reference area", common));
+    PetscCall(options.expressions(
+        "value", "kPa", "traction per reference area; numbers, or expressions of x, y, z (mm), t (s)", common));
     PulmoUserCheck(surfaces_.size() <= TractionKernels::max_surfaces, options.comm(),
                    "-traction_surfaces names more than %d surfaces; join some of them in the mesh",
                    static_cast<int>(TractionKernels::max_surfaces));
     for (std::size_t i = 0; i < surfaces_.size(); ++i) {
-      for (int d = 0; d < 3; ++d) parameters_.value[i][d] = common[d];
+      LoadExpression &load = loads_[i];
+      bool given;
+      load.values = common;
+      PetscCall(options.given("value_" + surfaces_[i], given));
+      load.option = given ? "-traction_value_" + surfaces_[i] : "-traction_value";
       PetscCall(
-          options.vector("value_" + surfaces_[i], "kPa", "traction on surface " + surfaces_[i], parameters_.value[i]));
+          options.expressions("value_" + surfaces_[i], "kPa", "traction on surface " + surfaces_[i], load.values));
+      for (int d = 0; load.constant() && d < 3; ++d) parameters_.value[i][d] = load.values[d].at(0, nullptr);
     }
+    comm_ = options.comm();
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
@@ -80,28 +117,46 @@ public:
     PetscFunctionBeginUser;
     PulmoUserCheck(!surfaces_.empty(), options.comm(), "-traction needs -traction_surfaces NAME,...");
     PetscCall(mesh.require_surfaces(surfaces_, "-traction_surfaces"));
+    for (std::size_t i = 0; i < surfaces_.size(); ++i) PetscCall(check_start(mesh, {surfaces_[i]}, loads_[i]));
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
-  PetscErrorCode terms(Composition &c, const SceneFacts &) const override
+  PetscErrorCode terms(Composition &c, const SceneFacts &facts) const override
   {
-    static constexpr auto each = std::make_index_sequence<TractionKernels::max_surfaces>();
-    static constexpr auto residuals = TractionKernels::residuals(each);
-    static constexpr auto works = TractionKernels::works(each);
+    using K = TractionKernels;
+    static constexpr auto callbacks = K::callbacks(std::make_index_sequence<K::max_surfaces>());
+    bool expressed = false;
 
     PetscFunctionBeginUser;
     c.parameters(parameters_);
     for (std::size_t i = 0; i < surfaces_.size(); ++i) {
-      c.surface_residual("-T . eta", surfaces_[i], displacement, f0(residuals[i]));
-      c.energy(Energy::external, "external", surfaces_[i], works[i]);
+      const bool number = loads_[i].constant();
+      c.surface_residual("-T . eta", surfaces_[i], displacement,
+                         f0(number ? callbacks[i].load : callbacks[i].expressed_load));
+      c.energy(Energy::external, "external", surfaces_[i], number ? callbacks[i].work : callbacks[i].expressed_work);
+      if (number) continue;
+      expressed = true;
+      loads_[i].facts = &facts;
+      expressions_.load[i] = constants::to_scalar(&std::as_const(loads_[i]));
     }
+    if (expressed) c.parameters(expressions_);
     PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+  std::vector<std::unique_ptr<Partner>> partners(const SceneFacts &) const override
+  {
+    std::vector<const LoadExpression *> loads;
+    for (std::size_t i = 0; i < surfaces_.size(); ++i) loads.push_back(&loads_[i]);
+    return LoadWatch::over(name(), comm_, loads);
   }
 
 private:
   bool on_ = false;
   std::vector<std::string> surfaces_;
+  MPI_Comm comm_ = MPI_COMM_NULL;
   TractionKernels::Parameters parameters_{};
+  mutable std::array<LoadExpression, TractionKernels::max_surfaces> loads_;
+  mutable TractionKernels::Expressions expressions_{};
 };
 
 } // namespace pulmo
