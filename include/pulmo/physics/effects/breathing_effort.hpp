@@ -226,7 +226,7 @@ private:
                    course.text().c_str());
     PulmoUserCheck(
         std::abs(first) <= rest, comm,
-        "-breathing_effort_course '%s' is %g cmH2O at t = 0; the effort begins from rest: it must be 0 there",
+        "-breathing_effort_course '%s' is %.6g cmH2O at t = 0; the effort begins from rest: it must be 0 there",
         course.text().c_str(), (double)first);
     PetscFunctionReturn(PETSC_SUCCESS);
   }
