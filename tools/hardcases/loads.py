@@ -285,6 +285,33 @@ def breaths(lab):
                    gained < ROW + 250)
 
 
+@case("A wall that turns", "energy balance with the work of turning; 2 ranks do the same; a sphere's free turns are told; the other directions end elsewhere",
+      "three directions on the sphere")
+def turning_wall(lab):
+    """A shell on springs along its current normal that stiffen 20 times on the way, dragged aside by a load that turns in time
+    while the wall pulls and 12 cmH2O come at once: every facet turns and slides, and nothing but the facets holds the shell's own turns."""
+    mesh = pulmo.CUBE if lab.small else ["-dm_plex_filename", pulmo.mesh("hollow_sphere.msh"), "-elements", "P1-P1"]
+    stiffening, load = (10, 0.02) if lab.small else (1, 0.05)
+    scene = pulmo.DIRECT + pulmo.SCENE + mesh + ["-airflow_permeability", 1e4, "-lumen_pressure", "on", "-ts_dt", 0.05, "-ts_max_time", 0.5,
+        "-ventilator", "pcv", "-ventilator_pip", 12, "-ventilator_ramp", 0, "-ventilator_settle", "off", "-chest_wall_surfaces", "pleura",
+        "-chest_wall_stiffening", stiffening, "-chest_wall_offset", 5, "-traction", "-traction_surfaces", "pleura",
+        "-traction_value", f"{load}*cos(2*pi*t),{load}*sin(2*pi*t),1e-4*x"]
+    wall = scene + ["-chest_wall_direction", "current_normal"]
+    run = lab.finished(wall, "turns")
+    two = lab.finished(wall, "the same on 2 ranks", ranks=2)
+    other = lab.finished(scene + ["-chest_wall_direction", "full"], "springs in full")
+    if run is None or two is None or other is None:
+        return
+    energy = run.json()["energy_j"]
+    lab.below("energy balance, residual over work", energy["residual_relative"], 1e-6)
+    lab.above("work of turning (J, absolute)", abs(energy["turning_springs"]), 1e-12)
+    volume, rest = run.signals()["volume_ml"], run.json()["reference_volume_ml"]
+    lab.below("2 ranks: volume beside that of one, over that at rest", np.abs(two.signals()["volume_ml"] - volume).max() / rest, 1e-7)
+    lab.above("springs in full: difference of the last volume, over that at rest", abs(other.signals()["volume_ml"][-1] - volume[-1]) / rest, 1e-4)
+    if not lab.small:
+        lab.true("the turns that only facets hold are told", "barely against rotation" in run.out + run.err)
+
+
 @case("Efforts that flutter", "each phase ends with the first row that meets its condition, or on time; energy balance; 2 ranks do the same")
 def flutter(lab):
     """Five efforts a second that rise and fall within a step or two, a trigger that 0.001 ml/s meets, an inspiration that ends soon: phases

@@ -81,7 +81,10 @@ class Traction final : public Effect {
 public:
   const char *name() const override { return "traction"; }
   const char *about() const override { return "dead load on named surfaces"; }
-  std::string example() const override { return "-traction -traction_surfaces airway -traction_value 0.1,-0.05,0.2"; }
+  std::string example() const override
+  {
+    return "-traction -traction_surfaces airway -traction_value 0.1,0.2*t-0.05,0.2+1e-3*y";
+  }
   bool active() const override { return on_; }
 
   PetscErrorCode declare(Options &options) override
