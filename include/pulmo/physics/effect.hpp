@@ -583,6 +583,10 @@ public:
   virtual const char *name() const = 0;
   /// One line for -help and the ledger: what it is and where it is published.
   virtual const char *about() const = 0;
+  /// For -scene_view, what it does in this scene (after check()), without a full stop; its options follow.
+  virtual std::string describe(const SceneFacts &) const { return about(); }
+  /// For -scene_view, what a scene without it leaves out, e.g. "nothing has weight". Empty: what about() says.
+  virtual const char *absence() const { return ""; }
   /// Options that bring it into a scene of a lung with the surfaces pleura and airway. The harness checks it with
   /// these.
   virtual std::string example() const { return std::string("-") + name(); }
