@@ -170,6 +170,7 @@ public:
 
   const char *name() const override { return "airflow"; }
   const char *about() const override { return "Darcy flow of alveolar air (mass balance, pressure field)"; }
+  const char *absence() const override { return "the gas has one pressure everywhere: no resistance to its flow"; }
   bool active() const override { return on_; }
   /// Open to the ventilator; without airflow the surfaces that would be.
   const std::vector<std::string> &surfaces() const { return surfaces_; }

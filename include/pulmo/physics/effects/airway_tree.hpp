@@ -114,6 +114,19 @@ public:
   {
     return "branching airways that resist the flow to each surface (Pedley, Schroter & Sudlow 1970)";
   }
+  std::string describe(const SceneFacts &) const override
+  {
+    const auto &branches = network_->branches();
+    const auto ends =
+        std::count_if(branches.begin(), branches.end(), [](const AirwayBranch &b) { return !b.surfaces.empty(); });
+    return std::string(about()) + ", branches: " + std::to_string(branches.size()) +
+           ", that end at the lung: " + std::to_string(ends);
+  }
+  const char *absence() const override
+  {
+    return "no airways between the opening and the lung: nothing resists there, and all open surfaces have one "
+           "pressure";
+  }
   std::string example() const override { return "-airway_tree star -airway_tree_resistance 5"; }
   bool active() const override { return !file_.empty() && file_ != "off"; }
 
@@ -121,11 +134,12 @@ public:
   {
     PetscFunctionBeginUser;
     options.group(name(), about());
-    PetscCall(options.text("",
-                           "table of branches (CSV: name, parent, length_mm, diameter_mm or "
-                           "resistance_cmH2O_s_per_l, compliance_ml_per_cmH2O, surface, region; docs/effects/airway_tree.md), "
-                           "or 'star': one branch from the opening to each surface; or 'off'",
-                           file_));
+    PetscCall(options.text(
+        "",
+        "table of branches (CSV: name, parent, length_mm, diameter_mm or "
+        "resistance_cmH2O_s_per_l, compliance_ml_per_cmH2O, surface, region; docs/effects/airway_tree.md), "
+        "or 'star': one branch from the opening to each surface; or 'off'",
+        file_));
     options.group(name(), "star", file_ == "star", "-airway_tree star");
     PetscCall(options.real("resistance", "cmH2O s/l", Range::not_negative(), "of each branch", resistance_));
     options.group(name(), "table of branches", active() && file_ != "star", "-airway_tree FILE");

@@ -92,6 +92,7 @@ class BreathingEffort final : public Effect {
 public:
   const char *name() const override { return "breathing_effort"; }
   const char *about() const override { return "suction by the muscles of breathing, which follows the surface"; }
+  const char *absence() const override { return "the muscles of breathing do nothing: a passive patient"; }
   std::string example() const override
   {
     return "-breathing_effort -breathing_effort_pressure 2 -breathing_effort_rise 0.4 -breathing_effort_hold 0.05 "

@@ -226,6 +226,7 @@ public:
     return "-chest_wall -chest_wall_direction current_normal -chest_wall_stiffening 0.3 -chest_wall_offset 0.5";
   }
   bool active() const override { return on_; }
+  const char *absence() const override { return "no springs hold the lung"; }
 
   PetscErrorCode declare(Options &options) override
   {

@@ -58,6 +58,7 @@ class Gravity final : public Effect {
 public:
   const char *name() const override { return "gravity"; }
   const char *about() const override { return "weight of tissue and air"; }
+  const char *absence() const override { return "nothing has weight"; }
   std::string example() const override
   {
     return "-gravity -gravity_direction 0.3,-1,0.2 -gravity_acceleration 20 -gravity_air_density 30 "

@@ -39,6 +39,7 @@ class LumenPressure final : public Effect {
 public:
   const char *name() const override { return "lumen_pressure"; }
   const char *about() const override { return "gas pressure on the airway wall"; }
+  const char *absence() const override { return "the gas does not press on the airway wall"; }
   bool active() const override { return on_; }
   const std::vector<std::string> &surfaces() const { return surfaces_; }
 

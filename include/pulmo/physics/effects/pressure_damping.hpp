@@ -40,6 +40,7 @@ class PressureDamping final : public Effect {
 public:
   const char *name() const override { return "pressure_damping"; }
   const char *about() const override { return "no oscillating pressure at very low permeability (numerical)"; }
+  const char *absence() const override { return "oscillations of the pressure are not damped (numerical)"; }
   bool active() const override { return on_; }
 
   PetscErrorCode declare(Options &options) override

@@ -96,6 +96,7 @@ class Recruitment final : public Effect {
 public:
   const char *name() const override { return "recruitment"; }
   const char *about() const override { return "airspaces open and close by pressure (after Bates & Irvin 2002)"; }
+  const char *absence() const override { return "airspaces neither open nor close"; }
   /// Low thresholds, so that a gentle breath crosses them.
   std::string example() const override
   {

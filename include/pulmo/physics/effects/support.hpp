@@ -16,6 +16,7 @@ class Support final : public Effect {
 public:
   const char *name() const override { return "support"; }
   const char *about() const override { return "prescribed displacement on surfaces, pins against rigid motions"; }
+  const char *absence() const override { return "no displacement is prescribed, and nothing is pinned"; }
   std::string example() const override
   {
     return "-support -support_surfaces airway -support_components_airway x -support_displacement_airway 0.1,0,0";

@@ -120,6 +120,10 @@ class Surfactant final : public Effect {
 public:
   const char *name() const override { return "surfactant"; }
   const char *about() const override { return "surface tension of the alveoli (after Saad, Neumann & Acosta 2010)"; }
+  const char *absence() const override
+  {
+    return "no surface tension of its own, but for what the tissue law holds of it";
+  }
   std::string example() const override
   {
     // stiff enough films that all branches of gamma are met, and a lung that stays stable

@@ -86,6 +86,7 @@ public:
     return "-traction -traction_surfaces airway -traction_value 0.1,0.2*t-0.05,0.2+1e-3*y";
   }
   bool active() const override { return on_; }
+  const char *absence() const override { return "no dead load pulls on a surface"; }
 
   PetscErrorCode declare(Options &options) override
   {

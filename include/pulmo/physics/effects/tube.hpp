@@ -15,6 +15,7 @@ class Tube final : public Effect {
 public:
   const char *name() const override { return "tube"; }
   const char *about() const override { return "endotracheal tube, pressure drop K1 Q + K2 |Q| Q (Rohrer 1915)"; }
+  const char *absence() const override { return "nothing resists between ventilator and airway"; }
   std::string example() const override { return "-tube -tube_k1 20"; }
   bool active() const override { return on_; }
 

@@ -39,6 +39,7 @@ public:
   {
     return "PCV, VCV, supersyringe or a programme of phases (sections 2.5, 2.6, 2.8)";
   }
+  const char *absence() const override { return "no ventilator: the airway stays at atmospheric pressure"; }
   bool active() const override { return mode_ != "off"; }
 
   PetscErrorCode declare(Options &options) override

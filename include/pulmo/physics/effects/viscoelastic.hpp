@@ -120,6 +120,7 @@ class Viscoelastic final : public Effect {
 public:
   const char *name() const override { return "viscoelastic"; }
   const char *about() const override { return "tissue that relaxes (quasi-linear overstress; after Fung 1993)"; }
+  const char *absence() const override { return "the tissue is elastic: it does not relax, and has no hysteresis"; }
   bool active() const override { return on_; }
 
   PetscErrorCode declare(Options &options) override
