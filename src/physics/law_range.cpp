@@ -67,10 +67,10 @@ PointState inflated_state(PetscReal J)
 }
 
 /// Least stiffness against a plane wave in free inflation, plus what rounding makes of it.
-PetscReal wave_stiffness(const TissueLaw &law, PetscReal J)
+PetscReal wave_stiffness(const TissueLaw &law, PetscReal J, const PetscScalar *constants)
 {
   PetscScalar A[81];
-  law.tangent(inflated_state(J), A);
+  law.tangent(inflated_state(J), constants, A);
   PetscReal size = 0;
   for (const PetscScalar a : A) size = std::max(size, std::abs(a));
   // laws are functions of invariants: in free inflation all directions are alike
@@ -183,20 +183,21 @@ PetscReal inflation_pressure(const TissueLaw &law, PetscReal J, const PetscScala
   return P[0] / (state.F[0] * state.F[0]); // dW/ds = 3 P, dJ/ds = 3 s^2
 }
 
-LawRange law_range(const TissueLaw &law)
+LawRange law_range(const TissueLaw &law, const PetscScalar *constants)
 {
   LawRange range;
   // beyond a barrier, or where it overflows, the energy is no number, though its derivatives may be
   const auto within = [&](PetscReal J, PetscReal value) {
-    return std::isfinite(law.energy(inflated_state(J))) ? value : std::numeric_limits<PetscReal>::quiet_NaN();
+    return std::isfinite(law.energy(inflated_state(J), constants)) ? value
+                                                                   : std::numeric_limits<PetscReal>::quiet_NaN();
   };
-  const auto stiffness = [&](PetscReal J) { return within(J, inflation_stiffness(law, J)); };
-  const auto wave = [&](PetscReal J) { return within(J, wave_stiffness(law, J)); };
+  const auto stiffness = [&](PetscReal J) { return within(J, inflation_stiffness(law, J, constants)); };
+  const auto wave = [&](PetscReal J) { return within(J, wave_stiffness(law, J, constants)); };
   // the fall of stiffness over an interval that is short beside the steps of first_loss(), and long beside rounding
   const auto fall = [&](PetscReal J) { return stiffness(J * (1 - 1e-4)) - stiffness(J * (1 + 1e-4)); };
   const auto state = [&](const std::optional<PetscReal> &J) -> std::optional<LawRange::State> {
     if (!J) return {};
-    return LawRange::State{*J, inflation_pressure(law, *J)};
+    return LawRange::State{*J, inflation_pressure(law, *J, constants)};
   };
 
   range.largest = state(first_loss(LawRange::largest_J, stiffness));

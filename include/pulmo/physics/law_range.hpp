@@ -32,8 +32,7 @@ std::string unstable_at_rest(const TissueLaw &law, const PetscScalar *constants 
 /// p = dW/dJ of tissue that inflates freely, kPa.
 PetscReal inflation_pressure(const TissueLaw &law, PetscReal J, const PetscScalar *constants = nullptr);
 
-/// Where free inflation from rest ends, with the parameters that no region has for itself. What is empty does not end
-/// between LawRange::least_J and largest_J.
+/// Where free inflation from rest ends. What is empty does not end between LawRange::least_J and largest_J.
 struct LawRange {
   static constexpr PetscReal least_J = 0.02, largest_J = 50;
   struct State {
@@ -46,7 +45,9 @@ struct LawRange {
   std::optional<State> softest;     ///< where dp/dJ is least in inflation: it stiffens from there on
   PetscReal softest_share = 1;      ///< dp/dJ there over that at rest
 };
-LawRange law_range(const TissueLaw &law);
+/// With the parameters that no region has for itself, or those of @p constants, of which StressFree::forget() was
+/// called.
+LawRange law_range(const TissueLaw &law, const PetscScalar *constants = nullptr);
 
 /// J of free inflation from rest to a pressure (kPa); nothing if dp/dJ turns negative before, or J leaves the range
 /// above. @p end: where it ends then. With @p constants of which StressFree::forget() was called, rest is that of the
