@@ -710,6 +710,21 @@ OptionList Options::own_used() const
   return list;
 }
 
+std::vector<Options::Setting> Options::settings(const std::string &group) const
+{
+  const std::string prefix = "-" + group;
+  std::vector<Setting> list;
+  for (const Declared &d : declared_) {
+    if (groups_[d.group].name != group || !groups_[d.group].in_use) continue;
+    const bool kind = d.unit == "-" || d.unit == "on/off" || d.unit == "text" || begins_with(d.unit, "one of ") ||
+                      begins_with(d.unit, "names,"); // of value, and no unit
+    std::string name = d.name.substr(std::min(d.name.size(), prefix.size() + 1));
+    std::replace(name.begin(), name.end(), '_', ' ');
+    list.push_back({name, d.used, kind ? "" : d.unit});
+  }
+  return list;
+}
+
 bool Options::at_default(const std::string &name) const
 {
   return std::any_of(declared_.begin(), declared_.end(),

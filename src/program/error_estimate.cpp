@@ -27,8 +27,8 @@ constexpr double least_coarsening = 1.2;
 constexpr PetscReal tighter = 0.01, tightest = 1e-12;
 
 /// Options of what a run leaves behind: a level writes nothing.
-constexpr const char *output_prefixes[] = {"-output",     "-progress", "-effects",       "-energy",
-                                           "-checkpoint", "-restart",  "-error_estimate"};
+constexpr const char *output_prefixes[] = {"-output",     "-progress", "-effects",        "-energy",
+                                           "-checkpoint", "-restart",  "-error_estimate", "-scene"};
 
 /// The runs that are compared, in this order: what is wrong with the other mesh is said before the rest is run.
 enum { fine, other, twice, four_times, tight, n_levels };

@@ -7,6 +7,7 @@
 #include "pulmo/input/errors.hpp"
 #include "pulmo/observers/output.hpp"
 #include "pulmo/physics/effects/pressure_damping.hpp"
+#include "pulmo/program/scene_view.hpp"
 
 #include <algorithm>
 
@@ -265,6 +266,7 @@ PetscErrorCode look_ahead(MPI_Comm comm, const Scene &scene, const Model &model,
   PetscCall(note_idle_springs(comm, model.composition()));
   PetscCall(check_damping(comm, scene, model));
   PetscCall(check_permeability(comm, scene, model, simulation.wanted_dt()));
+  PetscCall(warn_beyond_law(comm, scene, model));
   PetscCall(note_programme(comm, scene, simulation.wanted_dt()));
   if (!settle_note.empty()) PetscCall(PetscPrintf(comm, "pulmo: note: %s\n", settle_note.c_str()));
   PetscCall(note_no_breath(comm, scene));

@@ -9,6 +9,7 @@
 #include "pulmo/program/error_estimate.hpp"
 #include "pulmo/program/notes.hpp"
 #include "pulmo/program/unloading.hpp"
+#include "pulmo/program/scene_view.hpp"
 
 #include <algorithm>
 #include <csignal>
@@ -230,6 +231,7 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   Simulation &simulation = run.simulation();
   Output output;
   ErrorEstimate error_estimate(registry);
+  SceneView scene_view;
   Checkpoint checkpoint(options, output, scene, run.model(), simulation);
   bool view_effects = false, audit_energy = true, asked_to_stop = false;
   PetscBool help, has_mesh;
@@ -241,6 +243,7 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   PetscCall(output.declare(options));
   PetscCall(checkpoint.declare(options));
   PetscCall(error_estimate.declare(options));
+  PetscCall(scene_view.declare(options));
   options.group("effects", "ledger");
   PetscCall(options.flag("view", "print effects, fields, terms, blocks and seconds at the end", view_effects));
   options.group("energy", "energy balance");
@@ -256,8 +259,13 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
     PetscFunctionReturn(PETSC_SUCCESS);
   }
   PetscCall(check_held(comm, scene, run.model().composition()));
+  PetscCall(scene_view.print(options, scene, run.model(), simulation));
   PetscCall(look_ahead(comm, scene, run.model(), simulation, run.settle_note()));
   PetscCall(error_estimate.check(options, scene));
+  if (scene_view.only()) {
+    finished = true;
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
   const Elements &elements = scene.facts().elements;
   PulmoUserCheck(!output.error_indicator() || (elements.displacement_degree == 2 && elements.pressure_degree == 1),
                  comm,

@@ -133,6 +133,11 @@ public:
   PetscErrorCode all_used(OptionList &list) const;
   /// The first half of it: pulmo's own.
   OptionList own_used() const;
+  /// What the run uses of the options of an effect.
+  struct Setting {
+    std::string name, value, unit; ///< name: without the effect's, blanks for _; unit: empty if it has none
+  };
+  std::vector<Setting> settings(const std::string &group) const;
   /// Notes what an option says whose value names a file, and puts that in place of the value in a list: a file may
   /// move, or hold something else the next time.
   void note_content(const std::string &name, const std::string &content) { content_[name] = content; }
