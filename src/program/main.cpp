@@ -74,7 +74,8 @@ int exit_code(PetscErrorCode code, bool finished)
   }
 }
 
-/// What can be chosen: one line for each law and effect, what it is and its names first.
+/// What can be chosen: one line for each law and effect, what it is and its names first; then options that bring an
+/// effect into a scene, for tools that go through all of them.
 void print_list(const pulmo::Registry &registry)
 {
   const auto print = [](const char *kind, const std::string &names, const char *about) {
@@ -88,6 +89,7 @@ void print_list(const pulmo::Registry &registry)
   for (const auto &law : registry.make_permeability_laws()) print("permeability", law->name(), law->about());
   const pulmo::Scene scene(registry);
   for (const auto &effect : scene.effects()) print("effect", effect->name(), effect->about());
+  for (const auto &effect : registry.make_effects()) print("example", effect->name(), effect->example().c_str());
 }
 
 /// Makes what rank 0 has known to all ranks.

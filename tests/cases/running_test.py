@@ -313,7 +313,9 @@ class Sources(unittest.TestCase):
             for line in listed.out.splitlines():
                 kind, names, about = line.split(maxsplit=2)
                 of.setdefault(kind, {})[names] = about
-            self.assertEqual(list(of), ["tissue", "permeability", "effect"])
+            self.assertEqual(list(of), ["tissue", "permeability", "effect", "example"])
+            self.assertEqual([n for n, words in of["example"].items() if not words.startswith("-" + n)], [])
+            self.assertEqual(list(of["example"]), [n for n in of["effect"] if n not in ("tissue", "airflow", "ventilator")])
             self.assertIn(f"tissue law [one of {'|'.join(of['tissue'])}]", case.out)
             self.assertIn(f"[one of {'|'.join(of['permeability'])}]", case.out)
             for about in of["effect"].values():

@@ -19,7 +19,7 @@ import pulmo_case as pulmo
 sys.path.insert(0, os.path.join(pulmo.SOURCE, "tools"))
 sys.path.insert(0, os.path.join(pulmo.SOURCE, "tests/support"))
 import failed_tests  # noqa: E402
-from benchmarks import assembly, memory, operations, scaling  # noqa: E402
+from benchmarks import assembly, effects, memory, operations, scaling  # noqa: E402
 from hardcases import gallery, page  # noqa: E402
 from meshing import lung_command, sphere_command  # noqa: E402
 from shared import common, keys  # noqa: E402
@@ -397,8 +397,52 @@ class Tools(unittest.TestCase):
         with open(os.path.join(folder, "breaths.md")) as f:
             self.assertRegex(f.read(), r"run again:\n\n.*\n.*\n\| VCV 250 ml, PEEP 5 \| yoshihara \| @direct \| 0: finished \| 100 \|")
 
+    def test_benchmark_tells_what_effects_cost(self):
+        """One effect on a cube of a litre: what it changes is that of runs by hand, off costs nothing, a call again keeps the runs."""
+        folder, results = pulmo.scratch("page"), pulmo.scratch("effects")
+        few = ["effects", "--mesh", pulmo.mesh("cube_lung.msh"), "--effects", "tube", "airflow", "--repeat", "1", "--solver", "@direct",
+               "--output", folder, "--results", results, "--", "-mesh_scale 10 -ts_dt 0.1"]
+        made = benchmark(*few)
+        self.assertEqual(made.returncode, 0, made.stderr)
+        with open(os.path.join(folder, "cost.csv"), newline="") as f:
+            rows = {r["scene"]: r for r in csv.DictReader(f)}
+        self.assertEqual(list(rows), ["the scene", "+ tube", "− airflow"])
+        by_hand = {}
+        for label, words in ("the scene", []), ("+ tube", effects.ON["tube"].split()), ("− airflow", ["-airflow", "off"]):
+            by_hand[label] = pulmo.finished(["-dm_plex_filename", pulmo.mesh("cube_lung.msh")] + pulmo.options_file("scenes/pcv.opts") +
+                                            effects.SCENE.split() + pulmo.DIRECT + ["-mesh_scale", "10", "-ts_dt", "0.1"] + words).json()
+            self.assertEqual(int(rows[label]["Newton"]), by_hand[label]["newton_iterations"])
+            self.assertAlmostEqual(float(rows[label]["V_T ml"]), by_hand[label]["tidal_volume_ml"], delta=0.1)
+            energy = by_hand[label]["breaths"][-1]["energy_j"]
+            if label != "− airflow":
+                heat = sum(v for name, v in energy.items() if name.startswith("resistive"))
+                self.assertAlmostEqual(float(rows[label]["of it flow"]), 1e3 * heat, delta=0.6)
+                self.assertAlmostEqual(float(rows[label]["loop mJ"]), 1e3 * energy["ventilator_work"], delta=0.6)
+        self.assertGreater(float(rows["+ tube"]["R cmH2O s/l"]), float(rows["the scene"]["R cmH2O s/l"]) + 3)
+        with open(os.path.join(folder, "cost.md")) as f:
+            page = f.read()
+        self.assertIn("Counts: the same. States and signals: the same bit for bit.", page)
+        self.assertRegex(page, r"static pressure–volume curve, 8 points")
+        self.assertTrue(os.path.getsize(os.path.join(folder, "cost.png")))
+        self.assertEqual(benchmark(*few).stdout.count("kept"), 6)
+
+    def test_effects_show_up_by_themselves(self):
+        """One that the tool does not know comes by its example, one that the scene has goes off."""
+        entries = effects.entries_of(["tissue", "airflow", "ventilator", "chest_wall"],
+                                     {"cavity": "-cavity -cavity_gap 3", "chest_wall": "-chest_wall", "tube": "-tube -tube_k1 20"}, None)
+        self.assertEqual(entries["+ cavity"], "-cavity -cavity_gap 3")
+        self.assertEqual(entries["+ tube"], effects.ON["tube"])
+        self.assertEqual(entries[effects.ALL], "-cavity -cavity_gap 3 " + effects.ON["tube"])
+        self.assertEqual(entries["− airflow"], "-airflow off")
+        self.assertNotIn("+ chest_wall", entries)
+        self.assertNotIn("− tissue", entries)
+        every = pulmo.common.examples(pulmo.PROGRAM)
+        self.assertGreater(len(every), 10)
+        self.assertTrue(set(effects.ON) | set(effects.OFF) <= set(every))
+
     def test_benchmark_refuses(self):
         few = ["strategies", "pcv", "--mesh", pulmo.mesh("cube_lung.msh"), "--output", pulmo.scratch()]
+        made = ["--output", pulmo.scratch(), "--results", pulmo.scratch()]
         for arguments, named in ((few, "--"),
                                  (few + ["--", "@nothing"], "@direct"),
                                  (few + ["--", "direct"], "@"),
@@ -412,6 +456,8 @@ class Tools(unittest.TestCase):
                                  (["scaling", "--ranks", "2"], "begin with 1"),
                                  (["scaling", "--ranks", "1", "--count-ranks"], "several ranks"),
                                  (["scaling", "--", "@direct", "@iterative"], "one string"),
+                                 (["effects", "--mesh", "none.msh"], "none.msh"),
+                                 (["effects", "--effects", "blood", *made], "chest_wall"),
                                  (["solve", "--mesh", "none.msh"], "none.msh"),
                                  (["solve", "--stretch", "0.9"], "--stretch"),
                                  (["solve", "--dt", "2"], "--dt"),

@@ -57,13 +57,22 @@ def environment():
 
 
 @functools.cache
-def offered(program, kind):
-    """What a program offers of a kind (`tissue` or `permeability` laws, `effect`), by its -list: {name: alias, or nothing}."""
+def listed(program):
+    """(kind, names, the rest) of each line of a program's -list."""
     run = subprocess.run([program, "-list"], capture_output=True, text=True, env=environment())
     if run.returncode:
         fail(f"{program} -list ends with code {run.returncode}: {run.stderr.strip()}")
-    lines = [line.split() for line in run.stdout.splitlines()]
-    return {name: alias for this, names, *_ in lines if this == kind for name, _, alias in [names.partition("|")]}
+    return [tuple(line.split(maxsplit=2)) for line in run.stdout.splitlines()]
+
+
+def offered(program, kind):
+    """What a program offers of a kind (`tissue` or `permeability` laws, `effect`): {name: alias, or nothing}."""
+    return {name: alias for this, names, _ in listed(program) if this == kind for name, _, alias in [names.partition("|")]}
+
+
+def examples(program):
+    """{effect: options that bring it into a scene}."""
+    return {name: words for kind, name, words in listed(program) if kind == "example"}
 
 
 def tissue_laws(program):
