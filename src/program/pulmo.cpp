@@ -8,8 +8,8 @@
 #include "pulmo/physics/parameter_fields.hpp"
 #include "pulmo/program/error_estimate.hpp"
 #include "pulmo/program/notes.hpp"
-#include "pulmo/program/unloading.hpp"
 #include "pulmo/program/scene_view.hpp"
+#include "pulmo/program/unloading.hpp"
 
 #include <algorithm>
 #include <csignal>

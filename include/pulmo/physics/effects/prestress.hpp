@@ -234,7 +234,6 @@ class Prestress final : public Effect {
 public:
   const char *name() const override { return "prestress"; }
   const char *about() const override { return "the mesh is a lung under transpulmonary pressure"; }
-  const char *about() const override { return "the mesh is a lung under transpulmonary pressure (uniform stretch)"; }
   const char *absence() const override { return "the mesh is taken for a lung at rest, under no pressure"; }
   std::string example() const override { return "-prestress -prestress_pressure 2"; }
   bool active() const override { return on_; }
