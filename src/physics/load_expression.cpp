@@ -108,6 +108,7 @@ std::vector<std::unique_ptr<Partner>> LoadWatch::over(const char *name, MPI_Comm
   std::vector<std::unique_ptr<Partner>> list;
   loads.erase(std::remove_if(loads.begin(), loads.end(), [](const LoadExpression *l) { return l->constant(); }),
               loads.end());
+  for (const LoadExpression *load : loads) load->forget_fault();
   if (!loads.empty()) list.push_back(std::make_unique<LoadWatch>(name, comm, std::move(loads)));
   return list;
 }

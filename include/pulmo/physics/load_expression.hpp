@@ -39,6 +39,7 @@ public:
   };
   /// The first one so far, of this rank.
   const std::optional<Fault> &fault() const { return fault_; }
+  void forget_fault() const { fault_.reset(); }
 
 private:
   mutable std::optional<Fault> fault_;
@@ -61,7 +62,8 @@ public:
   const char *name() const override { return name_; }
   PetscErrorCode give_up(std::string &why) override { return find_fault(comm_, loads_, why); }
 
-  /// A watch on those of @p loads that are no plain numbers; none if all are.
+  /// A watch on those of @p loads that are no plain numbers; none if all are. What was evaluated before it, at times that
+  /// a run need not reach, is forgotten.
   static std::vector<std::unique_ptr<Partner>> over(const char *name, MPI_Comm comm,
                                                     std::vector<const LoadExpression *> loads);
 

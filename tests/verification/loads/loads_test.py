@@ -179,6 +179,9 @@ class Words(unittest.TestCase):
         self.refused(hold + ["0.01*(z>70 && t>0.25 ? 1/0 : 1),0,0"], "is inf at t = 0.3 s, (100, ", code=2, ranks=3)
         self.refused(BLOCK + STEPS + MOVED + ["log(0.25-t)-log(0.25),0,0"], "-support_displacement_x1 (component x)", "at t = 0.3 s", code=2)
 
+    def test_values_that_are_never_used(self):
+        pulmo.finished(BLOCK + ["-ts_dt", "0.1", "-ts_max_time", "0.2"] + MOVED + ["sqrt(0.25-t)-0.5,0,0"])
+
     def test_courses_of_an_effort(self):
         for course, *words in (("5*x", "x, y or z"), ("5+t", "5 cmH2O at t = 0"), ("5*", "column 3")):
             self.refused(Effort.EFFORT + ["-breathing_effort_course", course], "-breathing_effort_course", *words)
