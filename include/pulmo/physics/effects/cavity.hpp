@@ -104,6 +104,7 @@ class Cavity final : public Effect {
 public:
   const char *name() const override { return "cavity"; }
   const char *about() const override { return "the lung slides in a rigid cavity and touches its wall"; }
+  const char *absence() const override { return "no wall limits how far the lung moves"; }
   std::string example() const override
   {
     return "-cavity -cavity_gap 0.02 -cavity_spacing 1 -cavity_stiffness 2 -cavity_onset 0.05";
