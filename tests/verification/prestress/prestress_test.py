@@ -164,7 +164,7 @@ class Inverse(unittest.TestCase):
 
     def test_shells_of_two_tissues(self):
         """The unloaded volume against the radial equations, on meshes of a hollow sphere."""
-        inner, outer, levels, ratios = 30.0, 72.5, (3, 5), []
+        inner, outer, levels, ratios = 30.0, 72.5, (2, 4), []
         laws = (Birzle(), Birzle(c=3 * Birzle.c))
         for divisions in levels:
             mesh, dataset = pulmo.scratch("shells.msh"), pulmo.scratch("shells.h5")
@@ -172,9 +172,9 @@ class Inverse(unittest.TestCase):
                             "--inner", str(inner), "--outer", str(outer), "--output", mesh], check=True, capture_output=True)
             nodes, cells = tetrahedra(mesh)
             radii = np.unique(np.round(np.linalg.norm(nodes, axis=1), 6))
-            between = radii[divisions]
             self.assertEqual(len(radii), 2 * divisions + 1)
-            outside = np.linalg.norm(nodes[cells], axis=2).max(axis=1) > between + 1e-3
+            outside = np.linalg.norm(nodes[cells], axis=2).max(axis=1) > radii[divisions] + 1e-3
+            between = np.cbrt(inner**3 + 3 / (4 * np.pi) * volumes(nodes, cells)[~outside].sum())  # as inner and outer: those of equal volume
             with h5py.File(dataset, "w") as file:
                 file["c"] = np.where(outside, laws[1].c, laws[0].c)
             run = pulmo.finished(["-dm_plex_filename", mesh, "-tissue_c", dataset + ":c", "-ts_max_time", "0.1", "-ventilator", "pcv", "-ventilator_pip", "0",
@@ -184,16 +184,16 @@ class Inverse(unittest.TestCase):
         exact = unloaded_ratio(laws, (inner, between, outer), PRESTRESS * pulmo.KPA_PER_CMH2O)
         errors = [abs(r / exact - 1) for r in ratios]
         print("\nunloaded shells: ratio", ratios, "exact", exact, "off by", errors)
-        self.assertLess(errors[1], 0.6 * errors[0])
-        self.assertLess(errors[1], 1e-3)
+        self.assertLess(errors[1], errors[0] / 3)
+        self.assertLess(errors[1], 5e-5)
 
     def test_a_lung_under_its_weight_stays_where_it_is(self):
         """Two lungs of two tissues and densities, on one rank and on two: u = 0 to 1e-8 of a litre, and no settling."""
         ratios = []
         for ranks in (1, 2):
-            run = pulmo.finished(["-dm_plex_filename", pulmo.mesh("lung_pair.msh"), "-elements", "P1-P1", "-ventilator_pip", "0", "-ts_max_time", "0.1",
-                                  "-tissue", "yoshihara", "-tissue_c", "0.36,left_lung=0.72"] + pulmo.PCV + pulmo.TIGHT + pulmo.STILL + self.INVERSE
-                                 + ["-gravity", "-tissue_porosity", "0.75,left_lung=0.7"] + pulmo.QUIET, ranks=ranks)
+            run = pulmo.finished(pulmo.PCV + pulmo.TIGHT + pulmo.STILL + self.INVERSE + [
+                "-dm_plex_filename", pulmo.mesh("lung_pair.msh"), "-elements", "P1-P1", "-ventilator_pip", "0", "-ts_max_time", "0.1", "-tissue", "yoshihara",
+                "-tissue_c", "0.36,left_lung=0.72", "-gravity", "-tissue_porosity", "0.75,left_lung=0.7"] + pulmo.QUIET, ranks=ranks)
             rows = run.signals()
             self.assertLess(np.abs(rows["volume_ml"]).max(), 1e-5)
             self.assertLess(np.abs(rows["max_J"] - 1).max(), 1e-8)
@@ -214,18 +214,25 @@ class Inverse(unittest.TestCase):
         self.assertGreater(low_to_high("inverse"), 1.3)
         self.assertLess(low_to_high("stretch"), 1)
 
-    def test_a_weight_off_centre_is_told(self):
-        run = pulmo.finished(["-dm_plex_filename", pulmo.mesh("lung_pair.msh"), "-elements", "P1-P1", "-ts_max_time", "0.1"] + pulmo.PCV + pulmo.DIRECT
-                             + pulmo.STILL + self.INVERSE + ["-tissue", "yoshihara", "-gravity", "-tissue_porosity", "0.75"] + pulmo.QUIET)
-        self.assertNotIn("from the centre of a lung's volume", run.out)
+    def test_a_weight_off_the_centre_is_told(self):
+        dataset, word = pulmo.scratch("porosity.h5"), "from the centre of a lung's volume"
+        nodes, cells = tetrahedra(pulmo.mesh("cube_msh22_ascii.msh"))
+        with h5py.File(dataset, "w") as file:
+            file["even"] = np.full(len(cells), 0.75)
+            file["heavy_left"] = np.where(nodes[cells].mean(axis=1)[:, 0] < nodes[:, 0].mean(), 0.7, 0.8)
+        for name, told in (("even", False), ("heavy_left", True)):
+            run = pulmo.Case(["-dm_plex_filename", pulmo.mesh("cube_msh22_ascii.msh"), "-mesh_scale", "100", "-elements", "P1-P1"] + pulmo.PCV + pulmo.DIRECT
+                             + pulmo.STILL + self.INVERSE + ["-tissue", "yoshihara", "-gravity", "-tissue_porosity", f"{dataset}:{name}", "-ts_max_time", "0.05"]
+                             + pulmo.QUIET)
+            self.assertEqual(word in run.out, told, run.out + run.err)
 
     def test_newtons_matrix(self):
         """d sigma/d f against finite differences."""
-        run = pulmo.Case(pulmo.CUBE + pulmo.PCV + pulmo.TIGHT + pulmo.STILL + self.INVERSE + self.WEIGHT + ["-tissue", "birzle", "-gravity_acceleration", "1000",
+        run = pulmo.Case(pulmo.CUBE + pulmo.PCV + pulmo.TIGHT + pulmo.STILL + self.INVERSE + self.WEIGHT + ["-tissue", "birzle", "-gravity_acceleration", "100",
                          "-mesh_scale", "10", "-elements", "P1-P1", "-ts_max_time", "0.05", "-snes_test_jacobian", "-snes_max_it", "3"] + pulmo.QUIET)
-        ratios = [float(line.split("=")[1].split(",")[0]) for line in run.out.splitlines() if "||J - Jfd||_F/||J||_F" in line]
+        ratios = [float(line.split("=")[1].split(",")[0]) for line in run.out.splitlines() if "||J - Jfd||_F/||J||_F =" in line]
         self.assertGreater(len(ratios), 2, run.out + run.err)
-        self.assertLess(max(ratios), 1e-6)
+        self.assertLess(max(ratios), 1e-5)  # one-sided differences leave some 1e-6; a term too few, 1e-2
 
 
 def tetrahedra(path):
@@ -239,6 +246,11 @@ def tetrahedra(path):
             rows = [[int(word) for word in next(lines).split()] for _ in range(int(next(lines)))]
             cells = [row[-4:] for row in rows if row[1] == 4]
     return np.array(nodes, float), np.array(cells) - 1
+
+
+def volumes(nodes, cells):
+    corners = nodes[cells]
+    return np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / 6
 
 
 def unloaded_ratio(laws, radii, pressure):
