@@ -6,6 +6,7 @@
 #include "pulmo/physics/effects/cavity.hpp"
 #include "pulmo/physics/effects/chest_wall.hpp"
 #include "pulmo/physics/effects/gravity.hpp"
+#include "pulmo/physics/effects/inertia.hpp"
 #include "pulmo/physics/effects/lumen_pressure.hpp"
 #include "pulmo/physics/effects/pressure_damping.hpp"
 #include "pulmo/physics/effects/prestress.hpp"
@@ -51,6 +52,7 @@ Registry Registry::standard()
   r.effect<Cavity>();
   r.effect<ChestWall>();
   r.effect<Gravity>();
+  r.effect<Inertia>();
   r.effect<LumenPressure>();
   r.effect<PressureDamping>();
   r.effect<Prestress>();

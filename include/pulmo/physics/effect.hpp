@@ -43,6 +43,7 @@ struct Term {
   std::string surface; ///< empty: the whole volume
   PetscInt test = displacement;
   PetscInt trial = -1; ///< -1: a residual term
+  bool bears = true;   ///< may bear a load at rest; a mass does not
   PetscPointFunc f0 = nullptr, f1 = nullptr;
   PetscPointJac g0 = nullptr, g1 = nullptr, g2 = nullptr, g3 = nullptr;
   PetscBdPointFunc bd_f0 = nullptr, bd_f1 = nullptr;
@@ -267,6 +268,8 @@ public:
   {
     add(term(name, surface, test, trial), slots...);
   }
+  /// Says that the term added last resists motion alone: nothing rests on it.
+  void bears_nothing() { terms_.back().bears = false; }
   /// A term of the energy balance: work done on the lung in a step (external), growth of a stored energy, energy
   /// turned to heat (dissipated), and what backward Euler loses beside these: work of the term's force at the end of
   /// the step along the step, less what is stored (numerical).
@@ -410,7 +413,10 @@ private:
     return static_cast<PetscInt>(1 + parameters_.size() + (memories_.empty() ? 0 : memories_.size() + 1));
   }
   /// Whether a term resists displacement itself.
-  static bool resists(const Term &t) { return t.test == displacement && t.trial == displacement && (t.g0 || t.bd_g0); }
+  static bool resists(const Term &t)
+  {
+    return t.bears && t.test == displacement && t.trial == displacement && (t.g0 || t.bd_g0);
+  }
   Term term(const std::string &name, const std::string &surface, PetscInt test, PetscInt trial) const
   {
     Term t;
