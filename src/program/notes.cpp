@@ -236,6 +236,21 @@ PetscErrorCode note_weightless(MPI_Comm comm, const Scene &scene, const GravityA
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode note_massless(MPI_Comm comm, const Scene &scene)
+{
+  constexpr PetscReal light = 0.9, real = 0.75; // share of air
+  const PetscReal porosity = scene.tissue().porosity().reference;
+
+  PetscFunctionBeginUser;
+  for (const Effect *effect : scene.active())
+    if (effect->name() == std::string("inertia") && porosity > light)
+      PetscCall(PetscPrintf(comm,
+                            "pulmo: note: with -tissue_porosity %g the lung has hardly any mass, so that -inertia does "
+                            "almost nothing; give that of a real one, -tissue_porosity %g\n",
+                            (double)porosity, (double)real));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode warn_of_equal_order(MPI_Comm comm, const Scene &scene, const Model &model, PetscReal dt, bool &warned)
 {
   const SceneFacts &facts = scene.facts();

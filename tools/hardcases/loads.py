@@ -312,6 +312,31 @@ def turning_wall(lab):
         lab.true("the turns that only facets hold are told", "barely against rotation" in run.out + run.err)
 
 
+@case("A jump of pressure meets mass", "volume at rest beside that without mass; at no time more energy than was given; energy balance; steps of 10 µs", "the lung")
+def blow(lab):
+    """Inertia makes waves of what elsewhere is at rest at once: a jump of pressure sets all modes of the mesh swinging, the fastest of them thousands of times a
+    second, and in steps of 10 µs the mass outweighs the tissue. A scheme that is not stable for all of them gains energy and blows up."""
+    mass = ["-inertia", "-tissue_porosity", 0.75]
+    lung = pulmo.DIRECT + pulmo.PCV + (pulmo.LITRE if lab.small else pulmo.LUNG) + pulmo.STILL + [
+        "-elements", "P1-P1", "-ventilator_pip", 5, "-ventilator_ramp", 0]
+    still = lab.finished(lung + ["-ts_max_time", 0.1], "without mass")
+    for dt, end in ((0.02, 3), (1e-3, 0.04)) if lab.small else ((0.02, 3), (1e-3, 0.2), (1e-5, 4e-4)):
+        run = lab.finished(lung + mass + ["-ts_dt", dt, "-ts_max_time", end, "-ventilator_inspiration", end], f"Δt {dt:g} s")
+        if run is None:
+            continue
+        energy = run.signals("energy.csv")
+        kept = sum(energy[name + "_j"] for name in ("kinetic", "elastic_tissue", "elastic_springs"))
+        given = energy["ventilator_work_j"] + energy["external_j"]
+        lab.below(f"Δt {dt:g} s: energy kept beyond what was given, over the largest given", (kept - given).max() / given.max(), 1e-9)
+        lab.above(f"Δt {dt:g} s: least kinetic energy over the largest", energy["kinetic_j"].min() / energy["kinetic_j"].max(), -1e-9)
+        lab.below(f"Δt {dt:g} s: energy balance, residual over work", run.json()["energy_j"]["residual_relative"], 1e-6)
+        if dt == 0.02 and still:
+            lab.within("volume after 3 s beside that without mass (ml)", run.signals()["volume_ml"][-1], still.signals()["volume_ml"][-1], 1e-6)
+        if dt == 1e-3:
+            lab.below("Δt 1e-3 s: the lung starts slowly, volume after the first step over that at rest",
+                      run.signals()["volume_ml"][1] / still.signals()["volume_ml"][-1], 0.2)
+
+
 @case("Efforts that flutter", "each phase ends with the first row that meets its condition, or on time; energy balance; 2 ranks do the same")
 def flutter(lab):
     """Five efforts a second that rise and fall within a step or two, a trigger that 0.001 ml/s meets, an inspiration that ends soon: phases

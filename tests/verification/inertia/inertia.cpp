@@ -2,11 +2,12 @@
 #include "verification/support/column.hpp"
 #include "verification/support/history.hpp"
 #include "verification/support/integrators.hpp"
+#include "verification/support/lattice.hpp"
 
 #include "pulmo/observers/energy.hpp"
 
+#include <algorithm>
 #include <complex>
-#include <functional>
 
 using namespace pulmo;
 using namespace pulmo::test;
@@ -32,9 +33,23 @@ double share(int m)
   return 2 / (length * modulus * k * k);
 }
 
-const std::string common =
+/// The column in 16 bricks, with column.msh's names.
+const LatticeFile &bar()
+{
+  static const LatticeFile file = [] {
+    Lattice bricks = Lattice::box({16, 1, 1}, {1, 0.1, 0.1});
+    bricks.name = [](const Lattice::Place &x) {
+      const std::string face = Lattice::face_of_box(x);
+      return face[0] == 'x' ? face : std::string("sides_") + face[0];
+    };
+    return LatticeFile(bricks);
+  }();
+  return file;
+}
+
+const std::string swinging =
     " -airflow off -mesh_scale 100 -tissue_porosity 0.75 -inertia -inertia_tissue_density 1050 -inertia_air_density 1.2"
-    " -support_surfaces x0,sides_y,sides_z -traction -traction_surfaces x1 ";
+    " -traction -traction_surfaces x1 ";
 
 /// y_n of y' = i omega y, y_0 = 1, as @p integrator makes it with steps of @p h.
 std::vector<std::complex<double>> swing(const Integrator &integrator, double omega, double h, int steps)
@@ -64,7 +79,7 @@ struct Swing {
     Sampling sampling;
     EnergyAudit energy(run.scene(), run.model(), sampling);
     bool finished = false;
-    PULMO_OK(prepare(run, column::options(common + options)));
+    PULMO_OK(prepare(run, column::options(swinging + options) + " -dm_plex_filename " + bar().path()));
     PULMO_OK(sampling.setup(run.model()));
     PULMO_OK(energy.setup());
     run.simulation().add(energy);
@@ -87,8 +102,8 @@ std::string step_options(double end, int steps)
 
 TEST(Inertia, SwingsAndFadesAsEachSchemeMust)
 {
-  constexpr int steps = 80;
-  const double end = 2 * 2 * M_PI / frequency(0), h = end / steps; // two periods
+  constexpr int steps = 50;
+  const double end = 2 * M_PI / frequency(0), h = end / steps; // a period
   ASSERT_NEAR(frequency(0) / (2 * M_PI), 14.7, 0.1);
   for (const Integrator &integrator : integrators) {
     std::vector<double> expected(steps + 1, 0), kinetic(steps + 1, 0);
@@ -111,13 +126,22 @@ TEST(Inertia, SwingsAndFadesAsEachSchemeMust)
       apart = std::max(apart, std::abs(got.displacement[n] - expected[n]) / still);
       energy_apart = std::max(energy_apart, std::abs(got.kinetic[n] - kinetic[n]) / stored);
     }
-    std::printf("  %s: u apart by %.2e, kinetic energy by %.2e; u after two periods %.4f\n", integrator.name, apart,
+    std::printf("  %s: u apart by %.2e, kinetic energy by %.2e; u after a period %.4f\n", integrator.name, apart,
                 energy_apart, expected.back() / still);
     EXPECT_LT(apart, 1e-3) << integrator.name;
-    if (integrator.order > 1) continue; // the balance is that of backward Euler
-    EXPECT_LT(energy_apart, 1e-3);
-    EXPECT_LT(got.unbalanced, 1e-8);
+    if (integrator.order == 1) { // kinetic energy is followed with backward Euler alone
+      EXPECT_LT(energy_apart, 1e-3);
+    }
   }
+}
+
+TEST(Inertia, KeepsAccountsAtLargeStrain)
+{
+  constexpr int steps = 30;
+  Swing far; // 1 kPa: 11 % at rest, some 20 % at the turn
+  ASSERT_NO_FATAL_FAILURE(far.run("-traction_value 1,0,0" + step_options(2 * M_PI / frequency(0), steps)));
+  EXPECT_GT(*std::max_element(far.kinetic.begin(), far.kinetic.end()), 1e-3 * area * length * modulus);
+  EXPECT_LT(far.unbalanced, 1e-10);
 }
 
 TEST(Inertia, OrderInTime)
@@ -136,10 +160,10 @@ TEST(Inertia, OrderInTime)
     double error[2];
     for (int k = 0; k < 2; ++k) {
       Swing got;
-      ASSERT_NO_FATAL_FAILURE(got.run(pull + step_options(end, 40 << k) + integrator.options));
-      ASSERT_EQ(got.displacement.size(), static_cast<std::size_t>(1 + (40 << k)));
+      ASSERT_NO_FATAL_FAILURE(got.run(pull + step_options(end, 30 << k) + integrator.options));
+      ASSERT_EQ(got.displacement.size(), static_cast<std::size_t>(1 + (30 << k)));
       error[k] = (got.displacement.back() - expected) / still;
-      std::printf("  %s, %d steps: error %.3e of %.4f\n", integrator.name, 40 << k, error[k], expected / still);
+      std::printf("  %s, %d steps: error %.3e of %.4f\n", integrator.name, 30 << k, error[k], expected / still);
     }
     EXPECT_NEAR(std::log2(error[0] / error[1]), integrator.order, 0.15 * integrator.order) << integrator.name;
   }
@@ -147,14 +171,14 @@ TEST(Inertia, OrderInTime)
 
 TEST(Inertia, FallsAsItsWeightSays)
 {
-  constexpr double g = 50, dt = 0.4, pull = 2; // mm/s^2, s, kPa
-  constexpr int steps = 40;
+  constexpr double g = 0.5, dt = 0.4, pull = 2; // mm/s^2, s, kPa
+  constexpr int steps = 50;
   const std::string fall =
-      "-options_file " + source("petsc_options/solvers/tight.opts") + " -dm_plex_filename " +
-      source("meshes/column.msh") +
+      "-options_file " + source("petsc_options/solvers/tight.opts") + " -snes_atol 1e-10 -dm_plex_filename " +
+      bar().path() +
       " -tissue yoshihara -airflow off -support -support_surfaces sides_y,sides_z -support_components_sides_y y"
       " -support_components_sides_z z -tissue_porosity 0.5 -inertia -inertia_tissue_density 1e9"
-      " -inertia_air_density 1e9 -gravity -gravity_direction 1,0,0 -gravity_acceleration 0.05"
+      " -inertia_air_density 1e9 -gravity -gravity_direction 1,0,0 -gravity_acceleration 0.0005"
       " -gravity_tissue_density 1e9 -gravity_air_density 1e9 -traction -traction_surfaces x0,x1"
       " -traction_value_x0 -2,0,0 -traction_value_x1 2,0,0" +
       step_options(dt * steps, steps);
@@ -174,7 +198,7 @@ TEST(Inertia, FallsAsItsWeightSays)
     // the waves of the pull have faded: J is that of the pull, and all falls with g
     EXPECT_NEAR(1 + u1.back() - u0.back(), column::J_of_stress(pull), 1e-6) << integrator.name;
     for (int n = steps - 3; n <= steps; ++n)
-      EXPECT_NEAR((u0[n] - 2 * u0[n - 1] + u0[n - 2]) / (dt * dt), g, 1e-5 * g) << integrator.name;
+      EXPECT_NEAR((u0[n] - 2 * u0[n - 1] + u0[n - 2]) / (dt * dt), g, 1e-4 * g) << integrator.name;
   }
 }
 
