@@ -268,6 +268,30 @@ std::vector<ClinicalNumbers> breath_numbers(const std::vector<SignalRow> &rows)
   return list;
 }
 
+std::vector<PeepLevel> peep_levels(const std::vector<SignalRow> &rows)
+{
+  constexpr double same_level = 0.1; // cmH2O: less than a ventilator sets
+  std::vector<PeepLevel> levels;
+  for (const BreathRows &b : complete_breaths(rows)) {
+    const ClinicalNumbers n = clinical_numbers(rows, b.first, b.last);
+    const PeepLevel level{n.peep, b.last, n.compliance};
+    if (!levels.empty() && std::abs(levels.back().peep - n.peep) < same_level)
+      levels.back() = level;
+    else
+      levels.push_back(level);
+  }
+  if (levels.size() < 3) levels.clear();
+  return levels;
+}
+
+const PeepLevel *best_compliance(const std::vector<PeepLevel> &levels)
+{
+  const PeepLevel *best = nullptr;
+  for (const PeepLevel &level : levels)
+    if (level.compliance && (!best || *level.compliance > *best->compliance)) best = &level;
+  return best;
+}
+
 ClinicalNumbers overall_numbers(const std::vector<SignalRow> &rows)
 {
   const auto list = complete_breaths(rows);

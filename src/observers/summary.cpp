@@ -112,6 +112,27 @@ Json diagnosis_json(const Diagnosis &d)
   return json;
 }
 
+/// A trial of several levels of PEEP, with the columns of effects at the end of each; null if the run is none.
+Json peep_trial(const Composition &composition, const std::vector<SignalRow> &rows)
+{
+  const std::vector<PeepLevel> levels = peep_levels(rows);
+  const PeepLevel *best = best_compliance(levels);
+  if (levels.empty()) return nullptr;
+  Json json = {{"best_compliance_ml_per_cmH2O", best ? Json(*best->compliance) : Json(nullptr)},
+               {"peep_of_best_compliance_cmH2O", best ? Json(best->peep) : Json(nullptr)},
+               {"levels", Json::array()}};
+  for (const PeepLevel &level : levels) {
+    const SignalRow &end = rows[level.last];
+    Json one = {{"peep_cmH2O", level.peep},
+                {"breath", end.breath},
+                {"compliance_ml_per_cmH2O", optional_json(level.compliance)},
+                {"end_expiratory_volume_ml", end.volume}};
+    for (const SignalSpec &signal : composition.signals()) one[signal.name] = signal.value(end);
+    json["levels"].push_back(one);
+  }
+  return json;
+}
+
 /// Boundary that no effect uses.
 Json free_boundary_json(const std::vector<FreeBoundary> &parts)
 {
@@ -214,6 +235,7 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
       json["steady_change"] = unsteady ? Json(unsteady->change) : Json(nullptr);
       json["unsettled_volume_ml"] = optional_json(unsettled_volume(rows));
       json["static_curve"] = static_curve(rows);
+      json["peep_trial"] = peep_trial(model.composition(), rows);
       json["breaths"] = Json::array();
       for (const BreathRows &b : breath_rows(rows)) {
         Json breath = breath_json(rows, b, frc);

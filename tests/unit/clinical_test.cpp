@@ -275,6 +275,44 @@ TEST(Numbers, OverallAreThoseOfTheLastBreath)
   EXPECT_DOUBLE_EQ(overall.work, each[1].work);
 }
 
+TEST(PeepTrial, TakesTheLastBreathOfEachLevel)
+{
+  // C_rs of each breath: the first of a level is another's
+  const std::vector<std::pair<double, double>> breaths{{8, 30}, {8, 40}, {6, 70}, {6, 55}, {4, 50}, {2, 45}};
+  std::vector<SignalRow> rows(1);
+  int number = 0;
+  double time = 0;
+  rows[0].pressure = 8;
+  rows[0].phase = "settle";
+  for (const auto &[peep, C] : breaths) {
+    ++number;
+    rows.back().pressure = peep; // from which the breath starts
+    const double start = rows.back().volume;
+    for (int i = 1; i <= 20; ++i) {
+      SignalRow r;
+      r.time = time += 0.1;
+      r.dt = 0.1;
+      r.breath = number;
+      r.phase = i <= 10 ? "inspiration" : "expiration";
+      r.volume = start + 400 * std::sin(M_PI * i / 20);
+      r.flow = (r.volume - rows.back().volume) / r.dt;
+      r.pressure = peep + (r.volume - start) / C + 0.01 * r.flow;
+      rows.push_back(r);
+    }
+  }
+  const auto levels = peep_levels(rows);
+  ASSERT_EQ(levels.size(), 4u);
+  const double peep[] = {8, 6, 4, 2}, compliance[] = {40, 55, 50, 45};
+  for (int i = 0; i < 4; ++i) {
+    EXPECT_NEAR(levels[i].peep, peep[i], 1e-12);
+    EXPECT_NEAR(*levels[i].compliance, compliance[i], 1e-6);
+  }
+  EXPECT_EQ(best_compliance(levels), &levels[1]);
+  rows.resize(81); // two levels are no trial
+  EXPECT_TRUE(peep_levels(rows).empty());
+  EXPECT_EQ(best_compliance({}), nullptr);
+}
+
 // ------------------------------------------------------------------------- the end of inspiration, cut breaths
 
 /// Rows of one breath by volume and phase.

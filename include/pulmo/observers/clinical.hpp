@@ -97,6 +97,19 @@ ClinicalNumbers clinical_numbers(const std::vector<SignalRow> &rows, std::size_t
 /// One entry per complete breath.
 std::vector<ClinicalNumbers> breath_numbers(const std::vector<SignalRow> &rows);
 
+/// A level of PEEP in a trial of several.
+struct PeepLevel {
+  double peep;                      ///< cmH2O
+  std::size_t last;                 ///< last row of the breath at that level whose numbers count: its last one
+  std::optional<double> compliance; ///< C_rs of the fit to that breath, ml/cmH2O
+};
+
+/// The levels of PEEP that complete breaths start from, in their order; empty if there are fewer than three.
+std::vector<PeepLevel> peep_levels(const std::vector<SignalRow> &rows);
+
+/// The level of the largest compliance; null if none has one.
+const PeepLevel *best_compliance(const std::vector<PeepLevel> &levels);
+
 /// The numbers of the last complete breath. C_rs, R and time constant are fitted over its rows, but with the pressure
 /// and the volume from which the first breath starts: there the lung is at rest, also if later breaths trap gas.
 ClinicalNumbers overall_numbers(const std::vector<SignalRow> &rows);
