@@ -13,8 +13,9 @@
 #pragma once
 
 #include "pulmo/physics/effect.hpp"
-#include "pulmo/physics/effects/gravity.hpp"
 #include "pulmo/physics/porosity.hpp"
+
+#include <cmath>
 
 namespace pulmo {
 
@@ -137,10 +138,8 @@ public:
     c.energy(Energy::external, "external", "", energy_density<P, K::joining>);
     c.energy(Energy::numerical, "numerical_dissipation", "", energy_density<P, K::numerical>);
     if (facts.gravity)
-      c.require({[](const PetscScalar constants[]) {
-                   const auto heavy = constants::get<GravityKernels::Own>(constants);
-                   const auto inert = constants::get<K::Own>(constants);
-                   return heavy.tissue_density == inert.tissue_density && heavy.air_density == inert.air_density;
+      c.require({[mass = facts.gravity->mass.function](const PetscScalar constants[]) {
+                   return weighs_as(mass, constants, 0) && weighs_as(mass, constants, 1);
                  },
                  "-inertia and -gravity give tissue or air two densities; give -inertia_tissue_density and "
                  "-inertia_air_density what -gravity_tissue_density and -gravity_air_density are"});
@@ -148,6 +147,19 @@ public:
   }
 
 private:
+  /// Whether @p mass, a density by weight, is that of inertia where a side is longer by @p strain.
+  static bool weighs_as(EnergyDensity mass, const PetscScalar constants[], PetscScalar strain)
+  {
+    constexpr PetscReal rounding = 1e-12;
+    const PetscScalar H[9] = {strain, 0, 0, 0, 0, 0, 0, 0, 0};
+    PointState state;
+    make_point_state(H, nullptr, state);
+    const Point point{state, nullptr, 0, nullptr, 0, 0, nullptr, nullptr, Step()};
+    const PetscScalar heavy = InertiaKernels::kPa_per_mm * mass(point, point, constants),
+                      inert = InertiaKernels::density(state, constants::get<InertiaKernels::Parameters>(constants));
+    return std::abs(heavy - inert) <= rounding * inert;
+  }
+
   bool on_ = false;
   InertiaKernels::Own parameters_;
 };
