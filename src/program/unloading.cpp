@@ -15,6 +15,10 @@ namespace {
 
 /// A share of the load less than this is not tried.
 constexpr PetscReal least_share = 1. / 64;
+/// A shape is not solved where more than this share of the load is left.
+constexpr PetscReal unsolved = 1e-4;
+/// Rounding may leave as much of no load.
+constexpr PetscReal rounding = 1e-12;
 /// A moment is not told where the weight acts by less than this from the centre, over the size of the lung.
 constexpr PetscReal faint_arm = 1e-3;
 
@@ -38,9 +42,9 @@ public:
   /// Tells all points what balances the weight, body by body. @p pleura: of this, what pressure on the pleura can do;
   /// the rest are couples. @p arm: how far the weight acts from the centre of the volume, mm. Collective.
   PetscErrorCode balance(Unloading &unloading, std::vector<Vector3> &pleura, PetscReal &arm);
-  /// Solves under the whole load. @p solved: false if that failed, with the largest share that was solved for. @p left:
-  /// norm of the residual that is left.
-  PetscErrorCode solve(bool &solved, PetscReal &share, PetscReal &left);
+  /// Solves under the whole load, or under the largest @p share of it that Newton's method comes to. @p loaded: norm of
+  /// the residual of the mesh itself under the load; @p left: of the solution.
+  PetscErrorCode solve(PetscReal &share, PetscReal &loaded, PetscReal &left);
   /// Fills F0 of all points, and the volume of the shape; of what balances the weight leaves that of the pleura.
   /// Collective.
   PetscErrorCode result(Unloading &unloading, const std::vector<Vector3> &pleura);
@@ -51,6 +55,8 @@ private:
   /// Fills local_ from @p X.
   PetscErrorCode scatter(Vec X);
   PetscErrorCode try_share(PetscReal share, bool &solved);
+  /// Of the residual of X_ under the whole load.
+  PetscErrorCode norm(PetscReal &value);
 
   Model model_;
   Sampling sampling_;
@@ -61,8 +67,7 @@ private:
 
 PetscErrorCode UnloadedShape::setup(const Model &like, Composition composition, PetscReal modulus)
 {
-  char pc[64] = "";
-  PetscBool lu;
+  std::string pc;
   KSP ksp;
 
   PetscFunctionBeginUser;
@@ -70,9 +75,11 @@ PetscErrorCode UnloadedShape::setup(const Model &like, Composition composition, 
   model_.integrate_as(like);
   PetscCall(model_.build(std::move(composition), modulus));
   PetscCall(sampling_.setup(model_));
-  PetscCall(PetscOptionsGetString(nullptr, nullptr, "-pc_type", pc, sizeof(pc), nullptr));
-  PetscCall(PetscStrcmp(pc, PCLU, &lu));
-  if (!lu) PetscCall(attach_rigid_body_modes(model_.dm()));
+  PetscCall(wanted_pc(comm, pc));
+  PulmoUserCheck(
+      pc != PCCHOLESKY, comm,
+      "-pc_type cholesky needs a symmetric matrix, and that of -prestress_method inverse is not; use -pc_type lu");
+  if (pc != PCLU) PetscCall(attach_rigid_body_modes(model_.dm()));
   PetscCall(model_.create_matrix(matrix_.out()));
   PetscCall(DMCreateGlobalVector(model_.dm(), X_.out()));
   PetscCall(VecDuplicate(X_, kept_.out()));
@@ -144,12 +151,24 @@ PetscErrorCode UnloadedShape::try_share(PetscReal share, bool &solved)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode UnloadedShape::solve(bool &solved, PetscReal &share, PetscReal &left)
+PetscErrorCode UnloadedShape::norm(PetscReal &value)
+{
+  PetscFunctionBeginUser;
+  model_.set_load(1);
+  PetscCall(model_.set_step(Stage(1, 0, true), 0));
+  PetscCall(SNESComputeFunction(snes_, X_, kept_));
+  PetscCall(VecNorm(kept_, NORM_2, &value));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode UnloadedShape::solve(PetscReal &share, PetscReal &loaded, PetscReal &left)
 {
   PetscReal step = 1;
+  bool solved = false;
 
   PetscFunctionBeginUser;
   PetscCall(model_.memory()->begin());
+  PetscCall(norm(loaded));
   share = 0;
   while (share < 1 && step >= least_share) {
     PetscCall(VecCopy(X_, kept_));
@@ -161,8 +180,7 @@ PetscErrorCode UnloadedShape::solve(bool &solved, PetscReal &share, PetscReal &l
       step /= 2;
     }
   }
-  solved = share >= 1;
-  PetscCall(SNESGetFunctionNorm(snes_, &left));
+  PetscCall(norm(left));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -265,8 +283,7 @@ PetscErrorCode solve_unloaded_shape(Options &options, const Scene &scene, const 
   Unloading &unloading = *scene.facts().prestress->unloading;
   UnloadedShape shape;
   std::vector<Vector3> pleura;
-  bool solved = false;
-  PetscReal share, arm;
+  PetscReal share, loaded, arm;
 
   PetscFunctionBeginUser;
   Composition problem = composition.without_terms();
@@ -283,12 +300,16 @@ PetscErrorCode solve_unloaded_shape(Options &options, const Scene &scene, const 
                     "volume; no pressure on the pleura carries that moment, so whatever else holds the lung does, "
                     "and it turns a little before it breathes\n",
                     (double)arm));
-  PetscCall(shape.solve(solved, share, unloading.left));
-  PulmoUserCheck(solved, options.comm(),
+  PetscCall(shape.solve(share, loaded, unloading.left));
+  PulmoUserCheck(share >= 1, options.comm(),
                  "-prestress_method inverse: no unloaded shape was found beyond %.3g of the load (transpulmonary "
                  "pressure and weight); lower -prestress_pressure, take another law, or another solver file "
                  "(petsc_options/solvers/direct.opts)",
                  (double)share);
+  PulmoUserCheck(unloading.left <= std::max(rounding, unsolved * loaded), options.comm(),
+                 "-prestress_method inverse: the unloaded shape is hardly solved: %.2g of the load is not in balance; "
+                 "lower -snes_rtol and -snes_atol",
+                 (double)(unloading.left / loaded));
   PetscCall(shape.result(unloading, pleura));
   PetscFunctionReturn(PETSC_SUCCESS);
 }

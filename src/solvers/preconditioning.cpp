@@ -2,6 +2,7 @@
 
 #include "pulmo/base/simd.hpp"
 #include "pulmo/fem/pattern.hpp"
+#include "pulmo/input/errors.hpp"
 #include "pulmo/mesh/elements.hpp"
 #include "pulmo/physics/point.hpp"
 #include "pulmo/solvers/single_blocks.hpp"
@@ -314,16 +315,28 @@ PetscErrorCode register_p_multigrid()
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode wanted_pc(MPI_Comm comm, std::string &type)
+{
+  char text[64] = "";
+  PetscBool given;
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscOptionsGetString(nullptr, nullptr, "-pc_type", text, sizeof(text), &given));
+  PulmoUserCheck(
+      given, comm,
+      "no linear solver: give a solver file, e.g. -options_file petsc_options/solvers/direct.opts (or -pc_type)");
+  type = text;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode precondition_one_field(KSP ksp)
 {
-  char type[64] = "";
-  PetscBool fieldsplit;
+  std::string type;
   PC pc;
 
   PetscFunctionBeginUser;
-  PetscCall(PetscOptionsGetString(nullptr, nullptr, "-pc_type", type, sizeof(type), nullptr));
-  PetscCall(PetscStrcmp(type, PCFIELDSPLIT, &fieldsplit));
-  if (!fieldsplit) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(wanted_pc(PetscObjectComm((PetscObject)ksp), type));
+  if (type != PCFIELDSPLIT) PetscFunctionReturn(PETSC_SUCCESS);
   PetscCall(KSPGetPC(ksp, &pc));
   PetscCall(PCSetOptionsPrefix(pc, "fieldsplit_displacement_"));
   PetscFunctionReturn(PETSC_SUCCESS);

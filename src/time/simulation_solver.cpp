@@ -142,20 +142,14 @@ PetscErrorCode Simulation::create_solver()
   SNES snes;
   KSP ksp;
   TSAdapt adapt;
-  PetscBool has_pc, is_lu = PETSC_FALSE, is_cholesky = PETSC_FALSE;
-  char pc_type[64] = "";
+  std::string pc_type;
 
   PetscFunctionBeginUser;
-  PetscCall(PetscOptionsGetString(nullptr, nullptr, "-pc_type", pc_type, sizeof(pc_type), &has_pc));
+  PetscCall(wanted_pc(comm, pc_type));
   PulmoUserCheck(
-      has_pc, comm,
-      "no linear solver: give a solver file, e.g. -options_file petsc_options/solvers/direct.opts (or -pc_type)");
-  PetscCall(PetscStrcmp(pc_type, PCLU, &is_lu));
-  PetscCall(PetscStrcmp(pc_type, PCCHOLESKY, &is_cholesky));
-  PulmoUserCheck(
-      !is_cholesky || !scene_.facts().airflow, comm,
+      pc_type != PCCHOLESKY || !scene_.facts().airflow, comm,
       "-pc_type cholesky needs a symmetric matrix, and that of a scene with airflow is not; use -pc_type lu");
-  if (!is_lu) PetscCall(attach_rigid_body_modes(model_.dm())); // a factorisation has no use for them
+  if (pc_type != PCLU) PetscCall(attach_rigid_body_modes(model_.dm())); // a factorisation has no use for them
 
   PetscCall(TSCreate(comm, ts_.out()));
   PetscCall(TSSetDM(ts_, model_.dm()));

@@ -619,6 +619,12 @@ def table(m):
         "a Jacobian that is never made": (good + ["-snes_lag_jacobian", "-1"], ["-snes_lag_jacobian -1", "-2 for once"]),
         "multigrid that is applied once": (good + ["-pc_type", "gamg"], ["-ksp_type preonly", "-pc_type gamg", "fgmres"]),
         "no matrix to factorise": (good + ["-snes_mf"], ["-snes_mf", "-snes_mf_operator"]),
+        "a symmetric factorisation of the inverse": (
+            good + ["-airflow", "off", "-prestress", "-prestress_method", "inverse", "-pc_type", "cholesky"],
+            ["-pc_type cholesky", "-prestress_method inverse", "lu"]),
+        "an unloaded shape that is hardly solved": (
+            good + ["-prestress", "-prestress_method", "inverse", "-prestress_pressure", "2", "-snes_rtol", "0.5", "-snes_atol", "1"],
+            ["-prestress_method inverse", "-snes_rtol"]),
         "a symmetric factorisation": (good + ["-pc_type", "cholesky"], ["-pc_type cholesky", "symmetric", "lu"]),
         **{f"a matrix {name}": (good + ["-dm_mat_type" if name == "is" else "-mat_type", name], [f"mat_type {name}", "leave the option out"])
            for name in ("is", "sbaij", "nest", "dense", "shell")},

@@ -5,6 +5,7 @@
 
 #include "pulmo/fem/assembly.hpp"
 
+#include <string>
 #include <vector>
 
 namespace pulmo {
@@ -16,6 +17,8 @@ PetscErrorCode register_p_multigrid();
 
 /// Makes matrices of the displacement field of @p dm, also after a fieldsplit, carry the six rigid-body modes.
 PetscErrorCode attach_rigid_body_modes(DM dm);
+/// What -pc_type says; a user error if nothing does.
+PetscErrorCode wanted_pc(MPI_Comm comm, std::string &type);
 /// For a matrix of the displacement alone: where -pc_type is fieldsplit, what a solver file says of the displacement
 /// split preconditions the whole. To be called before options are taken.
 PetscErrorCode precondition_one_field(KSP ksp);
