@@ -446,10 +446,10 @@ class Tools(unittest.TestCase):
     def test_effects_show_up_by_themselves(self):
         """One that the tool does not know comes by its example, one that the scene has goes off."""
         entries = effects.entries_of(["tissue", "airflow", "ventilator", "chest_wall"],
-                                     {"cavity": "-cavity -cavity_gap 3", "chest_wall": "-chest_wall", "tube": "-tube -tube_k1 20"}, None)
-        self.assertEqual(entries["+ cavity"], "-cavity -cavity_gap 3")
+                                     {"bellows": "-bellows -bellows_depth 3", "chest_wall": "-chest_wall", "tube": "-tube -tube_k1 20"}, None)
+        self.assertEqual(entries["+ bellows"], "-bellows -bellows_depth 3")
         self.assertEqual(entries["+ tube"], effects.ON["tube"])
-        self.assertEqual(entries[effects.ALL], "-cavity -cavity_gap 3 " + effects.ON["tube"])
+        self.assertEqual(entries[effects.ALL], "-bellows -bellows_depth 3 " + effects.ON["tube"])
         self.assertEqual(entries["− airflow"], "-airflow off")
         self.assertNotIn("+ chest_wall", entries)
         self.assertNotIn("− tissue", entries)
