@@ -282,12 +282,17 @@ TEST(PeepTrial, TakesTheLastBreathOfEachLevel)
   std::vector<SignalRow> rows(1);
   int number = 0;
   double time = 0;
-  rows[0].pressure = 8;
   rows[0].phase = "settle";
   for (const auto &[peep, C] : breaths) {
+    SignalRow rest; // the new level, before the breath
+    rest.time = time += 0.1;
+    rest.dt = 0.1;
+    rest.phase = "settle";
+    rest.pressure = peep;
+    rest.volume = rows.back().volume;
+    rows.push_back(rest);
     ++number;
-    rows.back().pressure = peep; // from which the breath starts
-    const double start = rows.back().volume;
+    const double start = rest.volume;
     for (int i = 1; i <= 20; ++i) {
       SignalRow r;
       r.time = time += 0.1;
@@ -308,7 +313,7 @@ TEST(PeepTrial, TakesTheLastBreathOfEachLevel)
     EXPECT_NEAR(*levels[i].compliance, compliance[i], 1e-6);
   }
   EXPECT_EQ(best_compliance(levels), &levels[1]);
-  rows.resize(81); // two levels are no trial
+  rows.resize(1 + 4 * 21); // two levels are no trial
   EXPECT_TRUE(peep_levels(rows).empty());
   EXPECT_EQ(best_compliance({}), nullptr);
 }
