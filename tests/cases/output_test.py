@@ -575,7 +575,7 @@ class Help(unittest.TestCase):
             with open(os.path.join(scenes, name)) as f:
                 used |= set(re.findall(r"^(-(?!options_file)\w+)", f.read(), re.M))
         self.assertGreater(len(used), 5)
-        for option in used - {"-dm_plex_filename", "-snes_linesearch_type"}:  # PETSc's own
+        for option in used - {"-dm_plex_filename", "-snes_linesearch_type", "-ts_dt"}:  # PETSc's own
             self.assertRegex(own, rf"(?m)^  {option} ")
 
 
