@@ -464,6 +464,26 @@ PetscErrorCode Mesh::facets(const std::string &name, std::vector<PetscInt> &poin
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode Mesh::visit_surface(const std::string &name,
+                                   const std::function<void(const PetscReal x[3])> &visit) const
+{
+  std::vector<PetscInt> points;
+
+  PetscFunctionBeginUser;
+  PetscCall(facets(name, points));
+  for (const PetscInt facet : points) {
+    PetscInt *closure = nullptr, n;
+    PetscCall(DMPlexGetTransitiveClosure(dm_, facet, PETSC_TRUE, &n, &closure));
+    for (PetscInt i = 0; i < n; ++i) {
+      PetscReal x[3];
+      PetscCall(node_coordinates(closure[2 * i], x));
+      visit(x);
+    }
+    PetscCall(DMPlexRestoreTransitiveClosure(dm_, facet, PETSC_TRUE, &n, &closure));
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode Mesh::elements(const Part &part, std::vector<PetscInt> &points) const
 {
   ISHandle stratum;

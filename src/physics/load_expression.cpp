@@ -75,7 +75,7 @@ PetscErrorCode find_fault(MPI_Comm comm, const std::vector<const LoadExpression 
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode check_start(const Mesh &mesh, const std::vector<std::string> &surfaces, const LoadExpression &load)
+PetscErrorCode check_start(const Mesh &mesh, const std::string &surface, const LoadExpression &load)
 {
   const MPI_Comm comm = PetscObjectComm((PetscObject)mesh.dm());
   std::string why;
@@ -83,20 +83,7 @@ PetscErrorCode check_start(const Mesh &mesh, const std::vector<std::string> &sur
 
   PetscFunctionBeginUser;
   if (load.constant()) PetscFunctionReturn(PETSC_SUCCESS);
-  for (const std::string &surface : surfaces) {
-    std::vector<PetscInt> facets;
-    PetscCall(mesh.facets(surface, facets));
-    for (const PetscInt facet : facets) {
-      PetscInt *closure = nullptr, n;
-      PetscCall(DMPlexGetTransitiveClosure(mesh.dm(), facet, PETSC_TRUE, &n, &closure));
-      for (PetscInt i = 0; i < n; ++i) {
-        PetscReal x[3];
-        PetscCall(mesh.node_coordinates(closure[2 * i], x));
-        load.at(0, x, value.data());
-      }
-      PetscCall(DMPlexRestoreTransitiveClosure(mesh.dm(), facet, PETSC_TRUE, &n, &closure));
-    }
-  }
+  PetscCall(mesh.visit_surface(surface, [&](const PetscReal x[3]) { load.at(0, x, value.data()); }));
   PetscCall(find_fault(comm, {&load}, why));
   PulmoUserCheck(why.empty(), comm, "%s", why.c_str());
   PetscFunctionReturn(PETSC_SUCCESS);

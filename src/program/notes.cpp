@@ -203,6 +203,21 @@ PetscErrorCode warn_of_shrinking(MPI_Comm comm, const Simulation &simulation, co
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+/// The same porosity makes a lung without mass; with weight note_weightless() says so.
+PetscErrorCode note_massless(MPI_Comm comm, const Scene &scene)
+{
+  constexpr PetscReal light = 0.9, real = 0.75; // share of air
+  const PetscReal porosity = scene.tissue().porosity().reference;
+
+  PetscFunctionBeginUser;
+  if (scene.facts().inertia && !scene.facts().gravity && porosity > light)
+    PetscCall(PetscPrintf(comm,
+                          "pulmo: note: with -tissue_porosity %g the lung has hardly any mass, so that -inertia does "
+                          "almost nothing; give that of a real one, -tissue_porosity %g\n",
+                          (double)porosity, (double)real));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 /// Columns of the signals that rose above what an effect says they should.
 PetscErrorCode warn_of_limits(MPI_Comm comm, const Composition &composition, const std::vector<SignalRow> &rows)
 {
@@ -233,21 +248,6 @@ PetscErrorCode note_weightless(MPI_Comm comm, const Scene &scene, const GravityA
                           "almost nothing; a real one of that size weighs about %.3g g: give -tissue_porosity %.2f\n",
                           (double)scene.tissue().porosity().reference, volume, gravity.weight(), real * volume,
                           1 - real / tissue));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode note_massless(MPI_Comm comm, const Scene &scene)
-{
-  constexpr PetscReal light = 0.9, real = 0.75; // share of air
-  const PetscReal porosity = scene.tissue().porosity().reference;
-
-  PetscFunctionBeginUser;
-  for (const Effect *effect : scene.active())
-    if (effect->name() == std::string("inertia") && porosity > light)
-      PetscCall(PetscPrintf(comm,
-                            "pulmo: note: with -tissue_porosity %g the lung has hardly any mass, so that -inertia does "
-                            "almost nothing; give that of a real one, -tissue_porosity %g\n",
-                            (double)porosity, (double)real));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -282,6 +282,7 @@ PetscErrorCode look_ahead(MPI_Comm comm, const Scene &scene, const Model &model,
   PetscCall(check_damping(comm, scene, model));
   PetscCall(check_permeability(comm, scene, model, simulation.wanted_dt()));
   PetscCall(warn_beyond_law(comm, scene, model));
+  PetscCall(note_massless(comm, scene));
   PetscCall(note_programme(comm, scene, simulation.wanted_dt()));
   if (!settle_note.empty()) PetscCall(PetscPrintf(comm, "pulmo: note: %s\n", settle_note.c_str()));
   PetscCall(note_no_breath(comm, scene));

@@ -299,8 +299,6 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
     PetscCall(gravity.setup());
     PetscCall(note_weightless(comm, scene, gravity));
     simulation.add(gravity);
-  } else {
-    PetscCall(note_massless(comm, scene));
   }
   UnusedOptions unused(options, scene);
   simulation.add(unused);

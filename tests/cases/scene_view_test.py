@@ -1,5 +1,6 @@
 #!/usr/bin/python3
 """-scene_view: the scene in words, every effect in it or not in it, and how far its tissue goes against closed forms."""
+import os
 import re
 import unittest
 
@@ -35,6 +36,21 @@ def after(text, words):
 
 
 class Words(unittest.TestCase):
+    def test_every_scene_file_is_a_scene(self):
+        """As README gives them: those that are no manoeuvre after one."""
+        folder = os.path.join(pulmo.SOURCE, "petsc_options", "scenes")
+        names = sorted(name for name in os.listdir(folder) if name.endswith(".opts"))
+        self.assertGreater(len(names), 20)
+        for name in names:
+            with self.subTest(scene=name):
+                with open(os.path.join(folder, name)) as file:
+                    manoeuvre = re.search("^-ventilator ", file.read(), re.M)
+                before = [] if manoeuvre else pulmo.options_file("scenes/pcv.opts")
+                after = pulmo.programme("breath 1 pressure 5\n") if name == "programme.opts" else []
+                scene, _ = told(["-dm_plex_filename", pulmo.mesh("lung_pair.msh")] + before + pulmo.DIRECT + pulmo.options_file("scenes/" + name)
+                                + ["-elements", "P1-P1"] + after)
+                self.assertEqual(list(scene), SECTIONS)
+
     def test_each_effect_is_in_it_or_not(self):
         """Those of -list, so that a new one is told as well."""
         scene, _ = told(LUNG + ["-gravity", "-tube", "-tube_k1", "4"])

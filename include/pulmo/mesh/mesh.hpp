@@ -5,6 +5,7 @@
 #include "pulmo/mesh/elements.hpp"
 #include "pulmo/mesh/mesh_file.hpp"
 
+#include <functional>
 #include <map>
 #include <vector>
 
@@ -78,6 +79,8 @@ public:
   PetscErrorCode elements(const Part &part, std::vector<PetscInt> &points) const;
   /// The facets of a surface on this rank (mesh points).
   PetscErrorCode facets(const std::string &name, std::vector<PetscInt> &points) const;
+  /// Shows @p visit the corners, the middles of the edges and the middles of these facets, mm; each facet its own.
+  PetscErrorCode visit_surface(const std::string &name, const std::function<void(const PetscReal x[3])> &visit) const;
 
   /// User error, naming @p option and the surfaces that exist, unless all @p names are surfaces of the mesh.
   PetscErrorCode require_surfaces(const std::vector<std::string> &names, const std::string &option) const;

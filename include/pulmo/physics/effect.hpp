@@ -514,10 +514,9 @@ struct Unloading {
   std::function<void(Composition &)> terms;
   /// What is known of a point of a cell.
   struct AtPoint : std::array<PetscScalar, 13> {
-    static constexpr int F0 = 0;      ///< takes the stress-free shape to the mesh, 9
-    static constexpr int pleural = 9; ///< pressure less than that of the gas, kPa
-    static constexpr int gradient =
-        10; ///< its slope, kPa/mm, 3; while the shape is looked for, all that balances weight
+    static constexpr int F0 = 0;        ///< takes the stress-free shape to the mesh, 9
+    static constexpr int pleural = 9;   ///< pressure less than that of the gas, kPa
+    static constexpr int gradient = 10; ///< its slope, kPa/mm, 3; until the shape is found all that balances weight
     static constexpr int count = 13;
 
     explicit AtPoint(PetscScalar pressure) : std::array<PetscScalar, 13>{1, 0, 0, 0, 1, 0, 0, 0, 1, pressure, 0, 0, 0}
@@ -541,9 +540,9 @@ struct Unloading {
 /// A lung that is under pressure in the shape of the mesh, as others may know it.
 struct PrestressFacts {
   PetscReal pressure = 0; ///< transpulmonary, kPa
-  std::function<PetscReal(const PetscScalar constants[])>
-      volume;                           ///< unloaded, over that of the mesh; without unloading
-  std::shared_ptr<Unloading> unloading; ///< null: none is needed
+  /// Unloaded, over that of the mesh, at a point; null where it is solved for.
+  std::function<PetscReal(const PetscScalar constants[])> volume;
+  std::shared_ptr<Unloading> unloading; ///< null: the stress-free shape is known without solving
 };
 
 /// What one effect may know of the scene beside itself.
@@ -556,6 +555,7 @@ struct SceneFacts {
   bool porosity = false;                         ///< a kernel or an observer reads the tissue's porosity (Porosity)
   const PermeabilityLaw *permeability = nullptr; ///< that the gas flows by; null without airflow
   std::optional<GravityFacts> gravity;
+  bool inertia = false; ///< tissue and air have mass
   std::optional<PrestressFacts> prestress;
   PetscScalar (*pleural_suction)(PetscReal t, const PetscScalar constants[]) = nullptr; ///< by muscles, kPa; or none
   std::vector<std::string> airway_surfaces;    ///< open to the ventilator; without airflow those that would be

@@ -49,8 +49,8 @@ private:
 /// nothing.
 PetscErrorCode find_fault(MPI_Comm comm, const std::vector<const LoadExpression *> &loads, std::string &text);
 
-/// User error if @p load has a value that cannot be used on the vertices of @p surfaces at t = 0.
-PetscErrorCode check_start(const Mesh &mesh, const std::vector<std::string> &surfaces, const LoadExpression &load);
+/// User error if @p load has a value that cannot be used on the nodes of @p surface at t = 0.
+PetscErrorCode check_start(const Mesh &mesh, const std::string &surface, const LoadExpression &load);
 
 /// Ends a run in which a load had a value that cannot be used.
 class LoadWatch final : public Partner {
@@ -62,8 +62,8 @@ public:
   const char *name() const override { return name_; }
   PetscErrorCode give_up(std::string &why) override { return find_fault(comm_, loads_, why); }
 
-  /// A watch on those of @p loads that are no plain numbers; none if all are. What was evaluated before it, at times that
-  /// a run need not reach, is forgotten.
+  /// A watch on those of @p loads that are no plain numbers; none if all are. What was evaluated before it, at times
+  /// that a run need not reach, is forgotten.
   static std::vector<std::unique_ptr<Partner>> over(const char *name, MPI_Comm comm,
                                                     std::vector<const LoadExpression *> loads);
 

@@ -15,6 +15,11 @@ struct Porosity {
   PetscScalar air(PetscScalar J) const { return (J - 1 + reference) / reference; }
   /// J at which none is left.
   PetscScalar least_J() const { return 1 - reference; }
+  /// Density of tissue with densities @p tissue and @p air per volume at rest, (1 - Phi0) rho_t + (J - 1 + Phi0) rho_a.
+  PetscScalar density(PetscScalar J_minus_1, PetscScalar tissue, PetscScalar air) const
+  {
+    return (1 - reference) * tissue + (J_minus_1 + reference) * air;
+  }
   /// Eulerian porosity where the volume has changed by J.
   PetscScalar at(PetscScalar J) const { return 1 - (1 - reference) / J; }
 };

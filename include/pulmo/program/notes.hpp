@@ -16,8 +16,6 @@ PetscErrorCode look_ahead(MPI_Comm comm, const Scene &scene, const Model &model,
 /// A lung at rest has 0.2 to 0.3 g/ml, where the default porosity (the paper's, for which weight is nothing) gives
 /// 0.012.
 PetscErrorCode note_weightless(MPI_Comm comm, const Scene &scene, const GravityAudit &gravity);
-/// The same where such a lung has inertia and no weight.
-PetscErrorCode note_massless(MPI_Comm comm, const Scene &scene);
 /// Elements of equal order are not stable where the tissue is undrained: in steps @p dt (s) in which pressure spreads
 /// by less than half a cell, k M dt < (h/2)^2. Says so, once.
 PetscErrorCode warn_of_equal_order(MPI_Comm comm, const Scene &scene, const Model &model, PetscReal dt, bool &warned);

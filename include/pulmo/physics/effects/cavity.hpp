@@ -17,6 +17,7 @@
 #include "pulmo/mesh/mesh.hpp"
 #include "pulmo/mesh/signed_distance.hpp"
 #include "pulmo/physics/effect.hpp"
+#include "pulmo/physics/follower_pressure.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -86,17 +87,12 @@ struct CavityKernels {
   static void remember(const Point &point, const Parameters &k, PetscScalar value[])
   {
     const Contact c = contact(distance(point, k).distance, point, k);
-    const PetscScalar *cof = point.state.cof_F;
-    const PetscReal *N = point.normal;
-    PetscScalar square = 0;
-    for (int i = 0; i < 3; ++i) {
-      const PetscScalar n = cof[3 * i] * N[0] + cof[3 * i + 1] * N[1] + cof[3 * i + 2] * N[2];
-      square += n * n;
-    }
+    PetscScalar area[3] = {0, 0, 0}; // cof F N
+    add_follower_pressure(point, 1, area);
     const bool touches = c.q > 0 || k.tension != 0;
     value[0] = touches ? c.q : 0;
     value[1] = c.p;
-    value[2] = touches ? std::sqrt(square) : 0;
+    value[2] = touches ? std::hypot(area[0], area[1], area[2]) : 0;
   }
 };
 
@@ -247,23 +243,13 @@ private:
 
     PetscFunctionBeginUser;
     PetscCallMPI(MPI_Comm_rank(options.comm(), &own.rank));
-    for (const std::string &surface : surfaces_) {
-      std::vector<PetscInt> facets;
-      PetscCall(mesh.facets(surface, facets));
-      for (const PetscInt facet : facets) {
-        PetscInt *closure = nullptr, n;
-        PetscCall(DMPlexGetTransitiveClosure(mesh.dm(), facet, PETSC_TRUE, &n, &closure));
-        for (PetscInt i = 0; i < n; ++i) { // its middle, those of its edges, its corners
-          double x[3];
-          PetscCall(mesh.node_coordinates(closure[2 * i], x));
-          const double distance = wall_.distance(x);
-          if (distance >= own.distance) continue;
-          own.distance = distance;
-          std::copy_n(x, 3, where);
-        }
-        PetscCall(DMPlexRestoreTransitiveClosure(mesh.dm(), facet, PETSC_TRUE, &n, &closure));
-      }
-    }
+    for (const std::string &surface : surfaces_)
+      PetscCall(mesh.visit_surface(surface, [&](const PetscReal x[3]) {
+        const double distance = wall_.distance(x);
+        if (distance >= own.distance) return;
+        own.distance = distance;
+        std::copy_n(x, 3, where);
+      }));
     PetscCallMPI(MPI_Allreduce(&own, &least, 1, MPI_DOUBLE_INT, MPI_MINLOC, options.comm()));
     PetscCallMPI(MPI_Bcast(where, 3, MPI_DOUBLE, least.rank, options.comm()));
     PulmoUserCheck(

@@ -1,9 +1,8 @@
 /// @file
 /// Effect `chest_wall`: springs between lung surface and surroundings (Aviles-Rojas & Hurtado 2022, eq. 39).
 ///
-/// Traction per reference area T = -K_s (1 + s |d|) d (the paper prints +K_s, which would push outward; s = 0 there),
-/// by
-/// `-chest_wall_direction`:
+/// Traction per reference area T = -K_s (1 + s |d|) d (the paper prints +K_s, which would push outward; s = 0 there).
+/// By `-chest_wall_direction`:
 ///   full            d = u, on pleura and airway: the reading that reproduces the paper's Table 2
 ///   normal          d = (u . N) N, the paper's text
 ///   current_normal  d = (u . n) n with the normal n of the deformed surface, cof F N / |cof F N|: no friction

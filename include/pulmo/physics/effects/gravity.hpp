@@ -28,8 +28,7 @@ struct GravityKernels {
   /// R, kg/m^3.
   static PetscScalar density(const PointState &s, const Parameters &p)
   {
-    const PetscScalar air = s.J_minus_1 + p.other.reference;
-    return (1 - p.other.reference) * p.own.tissue_density + air * p.own.air_density;
+    return p.other.density(s.J_minus_1, p.own.tissue_density, p.own.air_density);
   }
   /// f0 of the momentum row: -R b.
   static void weight(const Point &point, const Parameters &p, PetscScalar f0[])

@@ -31,8 +31,7 @@ struct InertiaKernels {
   /// R, kPa s^2/mm^2.
   static PetscScalar density(const PointState &s, const Parameters &p)
   {
-    const PetscScalar tissue = 1 - p.other.reference, air = s.J_minus_1 + p.other.reference;
-    return kPa_per_mm * (tissue * p.own.tissue_density + air * p.own.air_density);
+    return kPa_per_mm * p.other.density(s.J_minus_1, p.own.tissue_density, p.own.air_density);
   }
   static PetscScalar acceleration(const Point &point, int i) { return point.step.slope * point.u_t[i] + point.past(i); }
 
@@ -118,7 +117,7 @@ public:
 
   PetscErrorCode announce(SceneFacts &facts) override
   {
-    facts.porosity = true;
+    facts.porosity = facts.inertia = true;
     return PETSC_SUCCESS;
   }
 

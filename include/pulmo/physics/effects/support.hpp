@@ -66,7 +66,7 @@ public:
                               held_[i].components.c_str()));
         value = 0;
       }
-      PetscCall(check_start(mesh, {surfaces_[i]}, held_[i].load));
+      PetscCall(check_start(mesh, surfaces_[i], held_[i].load));
     }
     PetscFunctionReturn(PETSC_SUCCESS);
   }

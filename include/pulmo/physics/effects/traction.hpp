@@ -121,7 +121,7 @@ public:
     PetscFunctionBeginUser;
     PulmoUserCheck(!surfaces_.empty(), options.comm(), "-traction needs -traction_surfaces NAME,...");
     PetscCall(mesh.require_surfaces(surfaces_, "-traction_surfaces"));
-    for (std::size_t i = 0; i < surfaces_.size(); ++i) PetscCall(check_start(mesh, {surfaces_[i]}, loads_[i]));
+    for (std::size_t i = 0; i < surfaces_.size(); ++i) PetscCall(check_start(mesh, surfaces_[i], loads_[i]));
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
