@@ -81,12 +81,13 @@ std::string words(const mu::Parser::exception_type &error, const std::string &te
 Expression Expression::read(const std::string &text, std::string &fault, std::size_t &column)
 {
   char *end = nullptr;
-  const PetscReal number = std::strtod(text.c_str(), &end);
+  const PetscReal number = std::strtod(text.c_str(), &end); // it also reads 0x10
   Expression result;
 
   fault.clear();
   column = 1;
-  if (!text.empty() && *end == '\0' && std::isfinite(number)) return {number};
+  if (!text.empty() && *end == '\0' && std::isfinite(number) && text.find_first_of("xX") == std::string::npos)
+    return {number};
   // muparser would set a variable
   for (std::size_t i = 0; i < text.size(); ++i) {
     if (text[i] != '=') continue;

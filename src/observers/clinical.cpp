@@ -273,9 +273,12 @@ std::vector<PeepLevel> peep_levels(const std::vector<SignalRow> &rows)
   constexpr double same_level = 0.1; // cmH2O: less than a ventilator sets
   std::vector<PeepLevel> levels;
   for (const BreathRows &b : complete_breaths(rows)) {
-    const ClinicalNumbers n = clinical_numbers(rows, b.first, b.last);
-    const PeepLevel level{n.peep, b.last, n.compliance};
-    if (!levels.empty() && std::abs(levels.back().peep - n.peep) < same_level)
+    const double peep = clinical_numbers(rows, b.first, b.last).peep;
+    std::size_t last = b.last; // a change to the next level belongs to the breath before it, and to no level
+    while (last > b.fullest && std::abs(rows[last].machine_pressure() - peep) >= same_level) --last;
+    if (last == b.fullest) last = b.last;
+    const PeepLevel level{peep, last, clinical_numbers(rows, b.first, last).compliance};
+    if (!levels.empty() && std::abs(levels.back().peep - peep) < same_level)
       levels.back() = level;
     else
       levels.push_back(level);

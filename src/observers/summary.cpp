@@ -112,7 +112,7 @@ Json diagnosis_json(const Diagnosis &d)
   return json;
 }
 
-/// A trial of several levels of PEEP, with the columns of effects at the end of each; null if the run is none.
+/// A trial of several levels of PEEP, with the columns of effects at the last moment of each; null if the run is none.
 Json peep_trial(const Composition &composition, const std::vector<SignalRow> &rows)
 {
   const std::vector<PeepLevel> levels = peep_levels(rows);

@@ -195,7 +195,7 @@ class Tools(unittest.TestCase):
         whole = pv_curve.sigmoid(pressure, 100, b, c, d)
         back = np.append(whole, np.minimum(whole[-2::-1] + 50, whole[-1] - 1))  # and a deflation limb, which does not count
         for lines in said(whole), said(back, np.append(pressure, pressure[-2::-1])):
-            self.assertEqual(lines, ["static curve: largest compliance 100.0 ml/cmH2O at 18.0 cmH2O", "lower inflection point 8.0 cmH2O",
+            self.assertEqual(lines, ["static curve: largest compliance 100 ml/cmH2O at 18.0 cmH2O", "lower inflection point 8.0 cmH2O",
                                      "upper inflection point 28.0 cmH2O"])
         self.assertIn("no upper inflection point between 0.0 and 20.0 cmH2O", said(whole[:8], pressure[:8]))
         self.assertIn("take these numbers with care", " ".join(said(whole + 100 * np.cos(pressure))))

@@ -284,22 +284,28 @@ TEST(PeepTrial, TakesTheLastBreathOfEachLevel)
   double time = 0;
   rows[0].phase = "settle";
   for (const auto &[peep, C] : breaths) {
-    SignalRow rest; // the new level, before the breath
-    rest.time = time += 0.1;
-    rest.dt = 0.1;
-    rest.phase = "settle";
-    rest.pressure = peep;
-    rest.volume = rows.back().volume;
-    rows.push_back(rest);
+    // the change to the new level belongs to the breath before it, and gas flows in it
+    const double from = rows.back().volume;
+    for (int i = 1; i <= 5; ++i) {
+      SignalRow r;
+      r.time = time += 0.1;
+      r.dt = 0.1;
+      r.phase = "expiration";
+      r.breath = number;
+      r.pressure = peep;
+      r.volume = from - 10 * i;
+      r.flow = (r.volume - rows.back().volume) / r.dt;
+      rows.push_back(r);
+    }
     ++number;
-    const double start = rest.volume;
-    for (int i = 1; i <= 20; ++i) {
+    const double start = rows.back().volume;
+    for (int i = 1; i <= 22; ++i) { // the last two at rest
       SignalRow r;
       r.time = time += 0.1;
       r.dt = 0.1;
       r.breath = number;
       r.phase = i <= 10 ? "inspiration" : "expiration";
-      r.volume = start + 400 * std::sin(M_PI * i / 20);
+      r.volume = start + (i < 20 ? 400 * std::sin(M_PI * i / 20) : 0);
       r.flow = (r.volume - rows.back().volume) / r.dt;
       r.pressure = peep + (r.volume - start) / C + 0.01 * r.flow;
       rows.push_back(r);
@@ -311,9 +317,10 @@ TEST(PeepTrial, TakesTheLastBreathOfEachLevel)
   for (int i = 0; i < 4; ++i) {
     EXPECT_NEAR(levels[i].peep, peep[i], 1e-12);
     EXPECT_NEAR(*levels[i].compliance, compliance[i], 1e-6);
+    EXPECT_NEAR(rows[levels[i].last].pressure, peep[i], 1e-12);
   }
   EXPECT_EQ(best_compliance(levels), &levels[1]);
-  rows.resize(1 + 4 * 21); // two levels are no trial
+  rows.resize(1 + 4 * 27); // two levels are no trial
   EXPECT_TRUE(peep_levels(rows).empty());
   EXPECT_EQ(best_compliance({}), nullptr);
 }

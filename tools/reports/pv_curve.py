@@ -54,7 +54,7 @@ def describe(summary):
     if found is None:
         return []
     (_, b, c, d), rms = found
-    lines = [f"static curve: largest compliance {b / (4 * d):.1f} ml/cmH2O at {c:.1f} cmH2O"]
+    lines = [f"static curve: largest compliance {b / (4 * d):.4g} ml/cmH2O at {c:.1f} cmH2O"]
     for name, point in (("lower", c - 2 * d), ("upper", c + 2 * d)):
         inside = pressure.min() <= point <= pressure.max()
         lines.append(f"{name} inflection point {point:.1f} cmH2O" if inside else

@@ -100,8 +100,8 @@ std::vector<ClinicalNumbers> breath_numbers(const std::vector<SignalRow> &rows);
 /// A level of PEEP in a trial of several.
 struct PeepLevel {
   double peep;                      ///< cmH2O
-  std::size_t last;                 ///< last row of the breath at that level whose numbers count: its last one
-  std::optional<double> compliance; ///< C_rs of the fit to that breath, ml/cmH2O
+  std::size_t last;                 ///< last row at that level of the last breath that starts from it
+  std::optional<double> compliance; ///< C_rs of the fit to that breath up to there, ml/cmH2O
 };
 
 /// The levels of PEEP that complete breaths start from, in their order; empty if there are fewer than three.

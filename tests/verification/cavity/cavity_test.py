@@ -226,6 +226,12 @@ class OwnShape(unittest.TestCase):
         self.assertLess(most, 0.1 * gap)
         self.assertLess(abs(run.json()["energy_j"]["residual_relative"]), 1e-6)
 
+    def test_without_a_gap_the_wall_is_the_surface(self):
+        run = pulmo.finished(pulmo.LUNG + pulmo.PCV + pulmo.DIRECT + pulmo.QUIET + ["-elements", "P1-P1", "-tissue", "ma", "-ts_max_time", "0.2", "-cavity",
+                             "-cavity_gap", "0", "-airflow", "off", "-chest_wall_surfaces", "airway", "-snes_linesearch_type", "l2"])
+        self.assertNotIn("the wall is not there", run.out)
+        self.assertGreater(run.signals()["cavity_contact_cm2"][-1], 700)  # of 821 with the airway
+
     def test_a_wall_holds_nothing_that_it_does_not_touch(self):
         run = pulmo.Case(pulmo.LUNG + pulmo.PCV + pulmo.DIRECT + ["-chest_wall", "off", "-cavity"])
         self.assertEqual(run.code, 1)

@@ -166,7 +166,7 @@ class Words(unittest.TestCase):
                              ("0,sin(y,0", "column 10", "parenthesis is not closed"), ("x=3,0,0", "column 2", "'='"),
                              ("0,0,0*", "column 7", "more must follow"), ("0,sin(x,y),0", "column", "too many arguments"),
                              ("1/0,0,0", "column 1", "not a number"), ("nan,0,0", "column 1", "'nan'"), ("1,2", "three numbers", "'1,2'"),
-                             ("-x,0,0", "write (-x)"), ("1,,2", "column 3", "empty")):
+                             ("-x,0,0", "write (-x)"), ("1,,2", "column 3", "empty"), ("0x10,0,0", "column 2", "'x10'")):
             self.refused(hold + [text], "-traction_value", *words)
         self.refused(BLOCK + STEPS + MOVED + ["5*q,0,0"], "-support_displacement_x1", "column 3", "'q'")
 

@@ -150,7 +150,7 @@ public:
     PetscCall(build(options));
     if (!file_.empty())
       PetscCall(check_inside(options, mesh));
-    else if (!tension_)
+    else if (!tension_ && parameters_.gap > 0)
       PetscCall(check_folds(options, mesh));
     PetscFunctionReturn(PETSC_SUCCESS);
   }
