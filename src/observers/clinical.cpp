@@ -221,6 +221,19 @@ void fit_with_intercept(const std::vector<SignalRow> &rows, std::size_t first, s
   numbers.equal_weight_resistance = R * 1000;
 }
 
+namespace {
+
+/// PEEP at the end of a breath: the pressure that the machine holds there, else that at its start, cmH2O.
+double peep_at_end(const std::vector<SignalRow> &rows, std::size_t first, std::size_t last)
+{
+  constexpr double same = 1e-9; // cmH2O: a pressure that is set is met to rounding
+  const double start = rows[first].machine_pressure(), end = rows[last].machine_pressure();
+  const bool held = last > first + 1 && !rows[last].pause() && std::abs(end - rows[last - 1].machine_pressure()) < same;
+  return held ? end : start;
+}
+
+} // namespace
+
 ClinicalNumbers clinical_numbers(const std::vector<SignalRow> &rows, std::size_t first, std::size_t last)
 {
   ClinicalNumbers n;
@@ -251,7 +264,7 @@ ClinicalNumbers clinical_numbers(const std::vector<SignalRow> &rows, std::size_t
     n.static_compliance = ratio(n.tidal_volume, *n.plateau_pressure - start.alveolar_pressure.value_or(n.peep));
   if (end.alveolar_pressure) {
     n.total_peep = *end.alveolar_pressure;
-    n.auto_peep = *end.alveolar_pressure - n.peep;
+    n.auto_peep = *end.alveolar_pressure - peep_at_end(rows, first, last);
   }
   n.work = work * units::kPa_per_cmH2O * 1e-3; // kPa ml = 1e-3 J
   const double duration = end.time - start.time;

@@ -102,15 +102,16 @@ PetscErrorCode keep_last_state(Checkpoint &checkpoint, const Simulation &simulat
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-/// Tells of options that nothing used as soon as all had their turn: after the first step.
+/// Tells of options that nothing used as soon as all had their turn: after the first step with something to solve.
 class UnusedOptions final : public Observer {
 public:
   UnusedOptions(Options &options, const Scene &scene) : options_(options), scene_(scene) {}
   PetscErrorCode observe(const StepReport &step) override
   {
     PetscFunctionBeginUser;
-    if (!done_ && step.row.dt > 0) PetscCall(options_.warn_unused(scene_.facts().airflow, false));
-    done_ = step.row.dt > 0;
+    if (done_ || step.row.krylov == 0) PetscFunctionReturn(PETSC_SUCCESS);
+    PetscCall(options_.warn_unused(scene_.facts().airflow, false));
+    done_ = true;
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 

@@ -417,6 +417,7 @@ def table(m):
         "a gap beside a file": (good + ["-cavity", "-cavity_file", text_file("with_gap.stl", stl(FACETS)), "-cavity_gap", "1"],
                                 ["-cavity_gap", "without -cavity_file"]),
         "a gap beside tension": (good + ["-cavity", "-cavity_tension", "-cavity_gap", "1"], ["-cavity_gap", "-cavity_tension"]),
+        "too coarse a wall": (good + ["-cavity", "-cavity_spacing", "1e3"], ["-cavity_spacing", "shape would be lost"]),
         "too fine a wall": (good + ["-cavity", "-cavity_spacing", "1e-3"], ["-cavity_spacing", "nodes"]),
         "a lung that only a wall holds": (good + ["-cavity", "-chest_wall", "off"], ["held in place by nothing", "does not touch"]),
         "a surface twice": (good + ["-chest_wall_surfaces", "pleura,pleura"], ["-chest_wall_surfaces", "'pleura' twice"]),

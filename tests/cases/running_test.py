@@ -285,6 +285,11 @@ class Sources(unittest.TestCase):
             warned = re.findall(r"^pulmo: warning: option (\S+) was not used", case.out, re.M)
             self.assertEqual(sorted(warned), sorted(told), case.out)
             self.assertLess(case.out.index("was not used"), case.out.index("   0.1000 "), "after the first step")
+        # nothing is left to solve before the load sets in
+        late = ["-traction", "-traction_surfaces", "pleura", "-traction_value", "0.02*(t>0.15),0,0", "-chest_wall_surfaces", "airway"]
+        case = pulmo.finished(pulmo.CUBE + pulmo.DIRECT + late +
+                              ["-tissue", "birzle", "-chest_wall", "-ts_dt", "0.1", "-ts_max_time", "0.3"])
+        self.assertNotIn("not used", case.out)
         case = pulmo.finished(BARE + SHORT + pulmo.options_file("solvers/iterative.opts") + ["-pc_type", "lu"])
         self.assertEqual(case.out.count("nothing uses the"), 1, case.out)
         self.assertEqual(case.out.count("not used"), 0, case.out)

@@ -554,6 +554,20 @@ TEST(ExactCompartment, PressureControl)
   EXPECT_NEAR(*n.auto_peep, lung.E * full * std::exp(-expiration / lung.tau()), 1e-9);
 }
 
+TEST(ExactCompartment, AutoPeepCountsFromThePeepOfTheBreathsEnd)
+{
+  Compartment lung;
+  const double expiration = 0.9, next = lung.peep - 2;
+  lung.pressure(15, 1, 60, "inspiration", 1);
+  const double full = lung.rows.back().volume;
+  lung.pressure(next, expiration, 60, "expiration", 1); // the next, lower level
+  const ClinicalNumbers n = overall_numbers(lung.rows);
+  EXPECT_NEAR(n.peep, lung.peep, 1e-12);
+  const double left = (full + 2 / lung.E) * std::exp(-expiration / lung.tau()); // above the volume of the new level
+  EXPECT_NEAR(*n.auto_peep, lung.E * left, 1e-9);
+  EXPECT_NEAR(*n.total_peep, next + lung.E * left, 1e-9);
+}
+
 TEST(ExactCompartment, ReadsTheMachinesSideOfATube)
 {
   Compartment lung;

@@ -23,8 +23,8 @@ struct ClinicalNumbers {
   std::optional<double> static_compliance;  ///< V_T / (plateau - total PEEP at the start), ml/cmH2O
   std::optional<double> dynamic_compliance; ///< V_T / (peak - PEEP), ml/cmH2O
   std::optional<double> static_curve_compliance; ///< slope of the inflation limb through the pauses, ml/cmH2O
-  std::optional<double> auto_peep;               ///< mean alveolar pressure at the end - PEEP, cmH2O
-  std::optional<double> total_peep;              ///< PEEP + auto-PEEP, cmH2O
+  std::optional<double> auto_peep;               ///< mean alveolar pressure at the end - PEEP there, cmH2O
+  std::optional<double> total_peep;              ///< mean alveolar pressure at the end, cmH2O
   double peep = 0;                               ///< pressure from which the breath starts, cmH2O
   double peak_pressure = 0;                      ///< cmH2O
   double driving_pressure = 0;                   ///< plateau - PEEP (peak - PEEP without a pause), cmH2O

@@ -209,6 +209,7 @@ private:
   PetscErrorCode build(const Options &options)
   {
     constexpr PetscReal share = 1. / 128; // of the cavity's size
+    constexpr double coarsest = 1. / 16;  // of it
     constexpr double share_lost = 0.05;   // of a spacing
     constexpr int margin = 8;             // spacings beyond the wall, for states on the way to a solution
     const PetscReal spacing = spacing_ > 0 ? spacing_ : share * surface_.size(),
@@ -216,6 +217,10 @@ private:
                     nodes = SignedDistance::nodes(surface_, spacing, reach);
 
     PetscFunctionBeginUser;
+    PulmoUserCheck(spacing <= coarsest * surface_.size(), options.comm(),
+                   "-cavity_spacing %g mm is too large for a cavity of %.3g mm: its shape would be lost; give %.2g mm "
+                   "or less",
+                   (double)spacing, surface_.size(), coarsest * surface_.size());
     PulmoUserCheck(
         nodes <= SignedDistance::most_nodes, options.comm(),
         "-cavity: a grid of %.3g mm around a cavity of %.3g mm and a gap of %.3g mm has %.2g nodes, more than "
