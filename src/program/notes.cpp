@@ -128,6 +128,21 @@ PetscErrorCode note_programme(MPI_Comm comm, const Scene &scene, PetscReal asked
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+/// Loads that come and go within a step: told, as a step that misses them is as quiet as one that has none.
+PetscErrorCode note_load_times(MPI_Comm comm, const Scene &scene, PetscReal dt)
+{
+  constexpr PetscReal rounding = 1e-6;
+
+  PetscFunctionBeginUser;
+  for (const auto &[seconds, of] : scene.facts().load_times)
+    if (dt > seconds * (1 + rounding))
+      PetscCall(PetscPrintf(comm,
+                            "pulmo: note: a step of %g s is longer than the %s (%.3g s), and may miss its height; give "
+                            "a smaller -ts_dt\n",
+                            (double)dt, of.c_str(), (double)seconds));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 /// Says where springs act on a surface that a support holds: they are never strained.
 PetscErrorCode note_idle_springs(MPI_Comm comm, const Composition &composition)
 {
@@ -284,6 +299,7 @@ PetscErrorCode look_ahead(MPI_Comm comm, const Scene &scene, const Model &model,
   PetscCall(warn_beyond_law(comm, scene, model));
   PetscCall(note_massless(comm, scene));
   PetscCall(note_programme(comm, scene, simulation.wanted_dt()));
+  PetscCall(note_load_times(comm, scene, simulation.wanted_dt()));
   if (!settle_note.empty()) PetscCall(PetscPrintf(comm, "pulmo: note: %s\n", settle_note.c_str()));
   PetscCall(note_no_breath(comm, scene));
   PetscFunctionReturn(PETSC_SUCCESS);

@@ -140,6 +140,11 @@ class Steps(Plausible):
         case = self.told(BASE + ["-ts_dt", "10", "-ventilator_ramp_down", "0.2"], "note", "longer than the ramp")
         self.assertEqual(len([w for w in words(case) if "too few" in w]), 1, case.out)
 
+    def test_steps_longer_than_an_effort(self):
+        effort = BASE + ["-breathing_effort", "-breathing_effort_fall", "0.04", "-ts_max_time", "0.05"]
+        self.told(effort + ["-ts_dt", "0.05"], "note", "longer than the rise or fall of -breathing_effort (0.04 s)")
+        self.assertNotIn("rise or fall", pulmo.finished(effort + ["-ts_dt", "0.025"]).out)
+
     def test_a_least_step_above_the_step(self):
         self.told(BASE + ["-ts_dt", "0.05", "-ts_adapt_dt_min", "0.2"], "warning", "-ts_adapt_dt_min")
 

@@ -547,6 +547,12 @@ struct PrestressFacts {
 
 /// What one effect may know of the scene beside itself.
 struct SceneFacts {
+  /// How fast a load comes or goes, s, and what says so: longer steps do not see it.
+  struct LoadTime {
+    PetscReal seconds;
+    std::string of;
+  };
+
   Elements elements;
   const TissueLaw *law = nullptr;                ///< of the tissue
   std::vector<StressFreeFunction> stress_free;   ///< where it is free of stress, if not in the shape of the mesh
@@ -560,6 +566,7 @@ struct SceneFacts {
   PetscScalar (*pleural_suction)(PetscReal t, const PetscScalar constants[]) = nullptr; ///< by muscles, kPa; or none
   std::vector<std::string> airway_surfaces;    ///< open to the ventilator; without airflow those that would be
   std::shared_ptr<const Programme> ventilator; ///< null without a ventilator
+  std::vector<LoadTime> load_times;            ///< of loads other than the ventilator's
   Settling settling;
   FlowSplit flow_split = FlowSplit::automatic;
   std::optional<AirwayResistance> tube; ///< between ventilator and airway

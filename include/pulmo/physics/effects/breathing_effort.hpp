@@ -15,6 +15,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <optional>
 
 namespace pulmo {
 
@@ -28,6 +29,14 @@ struct EffortCourse {
 
   /// The clock starts where a phase `settle` at the start of the run ends, s.
   PetscReal start() const { return delay + (facts ? end_of_settling(*facts) : 0); }
+  /// The shorter of rise and fall, s; empty for an expression, which does not say.
+  std::optional<PetscReal> fastest() const
+  {
+    if (expressed) return {};
+    if (times.empty()) return std::min(rise, fall);
+    const auto peak = std::max_element(pressures.begin(), pressures.end()) - pressures.begin();
+    return std::min(times[static_cast<std::size_t>(peak)], times.back() - times[static_cast<std::size_t>(peak)]);
+  }
   /// cmH2O at time @p t of the run.
   PetscReal at(PetscReal t) const
   {
@@ -150,6 +159,9 @@ public:
   PetscErrorCode announce(SceneFacts &facts) override
   {
     facts.pleural_suction = BreathingEffortKernels::pleural_suction;
+    if (const auto time = course_.fastest())
+      facts.load_times.push_back({*time, file_.empty() ? "rise or fall of -breathing_effort"
+                                                       : "rise or fall of -breathing_effort_file " + file_});
     return PETSC_SUCCESS;
   }
 
