@@ -2,6 +2,7 @@
 
 #include "pulmo/base/petsc.hpp"
 #include "pulmo/base/text_file.hpp"
+#include "pulmo/base/words.hpp"
 
 #include <algorithm>
 #include <cstdlib>
@@ -34,12 +35,6 @@ bool is_name(const std::string &word)
 bool is_name(const Word &word)
 {
   return !word.quoted && is_name(word.text);
-}
-
-std::string lower(std::string s)
-{
-  std::transform(s.begin(), s.end(), s.begin(), [](unsigned char c) { return c < 128 ? std::tolower(c) : c; });
-  return s;
 }
 
 bool is_one_of(const std::string &word, std::initializer_list<const char *> list)

@@ -2,6 +2,7 @@
 #include "pulmo/mesh/closed_surface.hpp"
 
 #include "pulmo/base/text_file.hpp"
+#include "pulmo/base/words.hpp"
 #include "pulmo/mesh/mesh.hpp"
 #include "pulmo/mesh/read_mesh.hpp"
 #include "pulmo/mesh/shared_points.hpp"
@@ -44,7 +45,7 @@ public:
   bool next(std::string &word)
   {
     if (!(in_ >> word)) return false;
-    std::transform(word.begin(), word.end(), word.begin(), [](unsigned char c) { return std::tolower(c); });
+    word = lower(word);
     return true;
   }
   bool number(double &value)
@@ -133,10 +134,9 @@ void take_triangles(const MeshFile &mesh, std::vector<Corners> &list)
 PetscErrorCode read_on_root(const std::string &file, PetscReal scale, ClosedSurface &surface, std::string &fault)
 {
   std::vector<Corners> list;
-  std::string ending = file.substr(std::min(file.size(), file.find_last_of('.')));
+  const std::string ending = lower(file.substr(std::min(file.size(), file.find_last_of('.'))));
 
   PetscFunctionBeginUser;
-  std::transform(ending.begin(), ending.end(), ending.begin(), [](unsigned char c) { return std::tolower(c); });
   if (ending == ".stl") {
     std::string content;
     if (!read_text(file, largest_stl, content) || content.empty())
