@@ -18,25 +18,10 @@ constexpr int directions = 6, refinements = 30;
 
 using Direction = std::array<PetscReal, 3>;
 
-/// Least eigenvalue of a symmetric 3 x 3 matrix, by Jacobi rotations: the characteristic polynomial would lose half of
-/// the digits where two eigenvalues are the same.
+/// Least eigenvalue of a symmetric 3 x 3 matrix.
 PetscReal least_eigenvalue(PetscReal S[3][3])
 {
-  constexpr int sweeps = 20;
-  for (int sweep = 0; sweep < sweeps; ++sweep)
-    for (int p = 0; p < 2; ++p)
-      for (int q = p + 1; q < 3; ++q) {
-        if (S[p][q] == 0) continue;
-        const int r = 3 - p - q;
-        const PetscReal theta = (S[q][q] - S[p][p]) / (2 * S[p][q]);
-        const PetscReal t = std::copysign(1 / (std::abs(theta) + std::hypot(theta, 1)), theta);
-        const PetscReal c = 1 / std::hypot(t, 1), s = t * c, of_p = S[r][p], of_q = S[r][q];
-        S[p][p] -= t * S[p][q];
-        S[q][q] += t * S[p][q];
-        S[p][q] = S[q][p] = 0;
-        S[r][p] = S[p][r] = c * of_p - s * of_q;
-        S[r][q] = S[q][r] = s * of_p + c * of_q;
-      }
+  diagonalize(S, nullptr);
   return std::min({S[0][0], S[1][1], S[2][2]});
 }
 

@@ -23,6 +23,7 @@
 #include "pulmo/physics/permeability/power.hpp"
 #include "pulmo/physics/tissue/berger.hpp"
 #include "pulmo/physics/tissue/birzle.hpp"
+#include "pulmo/physics/tissue/concha.hpp"
 #include "pulmo/physics/tissue/ma.hpp"
 #include "pulmo/physics/tissue/patte.hpp"
 #include "pulmo/physics/tissue/rausch.hpp"
@@ -40,6 +41,7 @@ Registry Registry::standard()
   r.tissue_law<Yoshihara>();
   r.tissue_law<Rausch>();
   r.tissue_law<Patte>();
+  r.tissue_law<Concha>();
   // permeability laws; the first is the default
   r.permeability_law<ConstantPermeability>();
   r.permeability_law<PowerPermeability>();

@@ -90,7 +90,7 @@ def tissue_laws():
     return common.tissue_laws(PROGRAM)
 
 
-# p = dW/dJ (kPa) of F = J^(1/3) I for J, s = J^(2/3) and t = J^(-1/3), with the parameters of Table 1, patte's of its header (not pulmo's code)
+# p = dW/dJ (kPa) of F = J^(1/3) I for J, s = J^(2/3) and t = J^(-1/3), with the parameters of Table 1, the others' of their headers (not pulmo's code)
 CLOSED_FORMS = {
     "berger": lambda J, s, t: 0.2808 * t + 0.4212 / 2 * J - (0.2808 + 0.4212 / 2) / (J - 1 + 0.99),
     "ma": lambda J, s, t: 2 * np.exp(G_MA * (s - 1) ** 2) * 2 * G_MA * (s - 1) * 2 / 3 * t,
@@ -98,6 +98,7 @@ CLOSED_FORMS = {
     "yoshihara": lambda J, s, t: 2 * 1.298 * (t - J ** (-2 * 0.75 - 1)),
     "rausch": lambda J, s, t: 16.5 / 2 * (J - 1 / J),
     "patte": lambda J, s, t: 2 * 0.2 * (t - 1 / J) + 4 * 0.4 * (1 / t - 1 / J) + 0.16 * (J - 1 / J) * np.exp(0.5 * (J**2 - 1) - np.log(J)),
+    "concha": lambda J, s, t: 4 * (1 - 0.69) * 10.33 / (12 - 9 * 0.56) * (t - t**4),
 }
 G_MA = 3 * (3 * 0.43 - 0.6) / 4
 

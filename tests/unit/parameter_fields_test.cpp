@@ -8,6 +8,7 @@
 #include "pulmo/observers/error_indicator.hpp"
 #include "pulmo/physics/effects/viscoelastic.hpp"
 #include "pulmo/physics/parameter_fields.hpp"
+#include "pulmo/physics/tissue/concha.hpp"
 
 #include <fstream>
 
@@ -102,6 +103,25 @@ TEST(ParameterFields, ListsHaveAValueOfEachPlace)
   PULMO_OK(signals(scene + "-viscoelastic_moduli 0.5,0.3 -viscoelastic_times 0.1,1", plain));
   PULMO_OK(signals(scene + "-viscoelastic_moduli 0.5,0.3,left=0.5,0.3 -viscoelastic_times 0.1,1,right=0.1,1", named));
   expect_same_run(plain, named);
+}
+
+TEST(ParameterFields, ALawOfThePorosityHasThatOfTheTissue)
+{
+  const Halves mesh;
+  for (const auto &[given, left, right] :
+       {std::tuple<const char *, double, double>{"", 0.69, 0.69}, // the law's own default
+        {"-tissue_porosity 0.8", 0.8, 0.8},
+        {"-tissue_porosity 0.75,right=0.6", 0.75, 0.6}}) {
+    SCOPED_TRACE(given);
+    const Registry registry = Registry::standard();
+    SceneRun run(registry);
+    PULMO_OK(prepare(run, mesh.options() + airflow + "-tissue concha " + given));
+    PULMO_OK(for_each_cell(run.model().dm(), [&, l = left, r = right](PetscInt c, const PetscReal x[3]) {
+      const double expected = x[0] > 1 ? r : l;
+      EXPECT_EQ(constants::get<Porosity>(run.model().constants_at(c)).reference, expected);
+      EXPECT_EQ(constants::get<Concha::Parameters>(run.model().constants_at(c)).porosity, expected);
+    }));
+  }
 }
 
 TEST(ParameterFields, EachCellAndFacetHasItsValue)

@@ -195,6 +195,10 @@ inline std::optional<double> inflation_pressure(const std::string &law, double J
     return 2 * beta1 * (t - 1 / J) + 4 * beta2 * (1 / t - 1 / J) +
            2 * alpha * delta * (J - 1 / J) * std::exp(delta * (J * J - 1)) * std::pow(J, -2 * delta);
   }
+  if (law == "concha") { // neither: all struts stretch by J^1/3, no angle changes
+    const double mu = 10.33, d = 0.56, porosity = 0.69;
+    return 12 * (1 - porosity) / (12 - 9 * d) * mu / 3 * (t - t * t * t * t);
+  }
   return {};
 }
 

@@ -24,7 +24,7 @@ NEW = [*PLAIN.split(), "-snes_ksp_ew", "0", "-ksp_rtol", "1e-5", "-ksp_converged
 PHASES = {"pressure": None, "flow": "pressure", "common": "pressure", "stretch": "pressure", "release": "stretch"}
 # mean J to which a lung without springs inflates with a regular tangent: yoshihara has a limit point at 2.53, birzle is
 # almost neutral from 1.5 on, rausch is stiff
-STRETCH = {"berger": 2.5, "ma": 2.5, "birzle": 1.4, "yoshihara": 2, "rausch": 1.3, "patte": 2}
+STRETCH = {"berger": 2.5, "ma": 2.5, "birzle": 1.4, "yoshihara": 2, "rausch": 1.3, "patte": 2, "concha": 1.4}
 COMMON = ["-ventilator_flow_split", "common_pressure"]
 INFLATION, INFLATION_STEPS = 10, 20  # s
 HEADER = ["solver", "law", "tetrahedra", "phase", "k mm²/(kPa s)", "dt s", "largest J", "Newton", "solves", "Krylov/solve",

@@ -13,11 +13,19 @@
 ///
 ///   static EnergyDerivatives derivatives(const Invariants<> &, const Parameters &);
 ///
-/// takes these instead: faster, and compared with the others by the tests.
+/// takes these instead: faster, and compared with the others by the tests. A law of the principal stretches, in any
+/// order of them, has in place of uses_I2 and W
+///
+///   static StretchDerivatives of_stretches(const PetscScalar minus_1[3], const Parameters &);   of l_a - 1
+///
+/// which is no number where the law has no answer. A law that depends on the reference porosity has
+///
+///   static PetscScalar &porosity(Parameters &);   becomes -tissue_porosity, whose default it holds before
 #pragma once
 
 #include "pulmo/physics/dual.hpp"
 #include "pulmo/physics/point.hpp"
+#include "pulmo/physics/principal.hpp"
 #include "pulmo/physics/stress_free.hpp"
 
 #include <cmath>
@@ -73,6 +81,22 @@ constexpr bool
     has_derivatives<Law, std::void_t<decltype(Law::derivatives(std::declval<const Invariants<> &>(),
                                                                std::declval<const typename Law::Parameters &>()))>> =
         true;
+
+/// Whether a law is one of the principal stretches.
+template <class Law, class = void>
+constexpr bool of_stretches = false;
+template <class Law>
+constexpr bool
+    of_stretches<Law, std::void_t<decltype(Law::of_stretches(std::declval<const PetscScalar *>(),
+                                                             std::declval<const typename Law::Parameters &>()))>> =
+        true;
+
+/// Whether a law depends on the reference porosity.
+template <class Law, class = void>
+constexpr bool has_porosity = false;
+template <class Law>
+constexpr bool has_porosity<Law, std::void_t<decltype(Law::porosity(std::declval<typename Law::Parameters &>()))>> =
+    true;
 
 /// A law that gives its W alone, whatever else it has.
 template <class Law>
@@ -169,22 +193,31 @@ struct TissueKernels {
   static void stress(const Point &point, const Parameters &k, PetscScalar f1[])
   {
     const PointState &s = point.state;
-    PetscScalar C[9];
-    const Invariants<> inv = invariants(s, Law::uses_I2, C);
-    const EnergyDerivatives e = energy_derivatives<Law, false>(inv, k);
-    for (int i = 0; i < 9; ++i) f1[i] += 2 * e.W1 * s.F[i] + e.WJ * s.cof_F[i];
-    if constexpr (Law::uses_I2) {
-      PetscScalar B[9];
-      half_dI2_dF(s, inv, C, B);
-      for (int i = 0; i < 9; ++i) f1[i] += 2 * e.W2 * B[i];
+    if constexpr (of_stretches<Law>) {
+      const PrincipalStretches at(s);
+      add_principal_stress(at, Law::of_stretches(at.minus_1, k), f1);
+    } else {
+      PetscScalar C[9];
+      const Invariants<> inv = invariants(s, Law::uses_I2, C);
+      const EnergyDerivatives e = energy_derivatives<Law, false>(inv, k);
+      for (int i = 0; i < 9; ++i) f1[i] += 2 * e.W1 * s.F[i] + e.WJ * s.cof_F[i];
+      if constexpr (Law::uses_I2) {
+        PetscScalar B[9];
+        half_dI2_dF(s, inv, C, B);
+        for (int i = 0; i < 9; ++i) f1[i] += 2 * e.W2 * B[i];
+      }
     }
   }
 
   /// Strain energy density W, kPa.
   static PetscScalar energy(const PointState &s, const Parameters &k)
   {
-    PetscScalar C[9];
-    return Law::W(invariants(s, Law::uses_I2, C), k);
+    if constexpr (of_stretches<Law>) {
+      return Law::of_stretches(PrincipalStretches(s).minus_1, k).W;
+    } else {
+      PetscScalar C[9];
+      return Law::W(invariants(s, Law::uses_I2, C), k);
+    }
   }
 
   /// Growth of W over a step, kPa.
@@ -206,6 +239,16 @@ struct TissueKernels {
   static void tangent(const Point &point, const Parameters &k, PetscScalar g3[])
   {
     const PointState &s = point.state;
+    if constexpr (of_stretches<Law>)
+      add_principal_tangent(
+          PrincipalStretches(s), [&](const PetscScalar *minus_1) { return Law::of_stretches(minus_1, k); }, g3);
+    else
+      tangent_of_invariants(s, k, g3);
+  }
+
+private:
+  static void tangent_of_invariants(const PointState &s, const Parameters &k, PetscScalar g3[])
+  {
     const PetscScalar *F = s.F, *cof = s.cof_F;
     PetscScalar C[9], B[9];
     const Invariants<> inv = invariants(s, Law::uses_I2, C);
@@ -340,6 +383,8 @@ public:
   virtual const char *alias() const = 0;
   virtual const char *source() const = 0;
   virtual PetscErrorCode declare(Options &options) = 0;
+  /// The law's own copy of the reference porosity; it holds the law's default. Null: the law does not depend on it.
+  virtual PetscScalar *porosity() = 0;
   virtual const PetscScalar *parameters(PetscInt *count) const = 0;
   /// @p strained: effects say where the tissue is free of stress.
   virtual LawCallbacks callbacks(bool strained) const = 0;
@@ -384,6 +429,13 @@ public:
   const char *alias() const override { return Law::alias; }
   const char *source() const override { return Law::source; }
   PetscErrorCode declare(Options &options) override { return Law::declare(options, parameters_); }
+  PetscScalar *porosity() override
+  {
+    if constexpr (has_porosity<Law>)
+      return &Law::porosity(parameters_);
+    else
+      return nullptr;
+  }
   const PetscScalar *parameters(PetscInt *count) const override
   {
     *count = sizeof(Parameters) / sizeof(PetscScalar);

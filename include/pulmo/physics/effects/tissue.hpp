@@ -40,12 +40,15 @@ public:
     const auto found = std::find_if(laws_.begin(), laws_.end(),
                                     [&](const auto &law) { return wanted == law->name() || wanted == law->alias(); });
     chosen_ = static_cast<std::size_t>(found - laws_.begin());
+    PetscScalar *porosity_of_law = laws_[chosen_]->porosity();
+    if (porosity_of_law) porosity_.reference = *porosity_of_law;
     PetscCall(options.real("porosity", "-", {0, 1, true},
                            "reference porosity Phi0: share of the volume at rest that is air (by region: "
                            "0.99,right=0.7)",
                            porosity_.reference));
     options.only_volumes(porosity_.reference);
     porosity_varies_ = options.varies(porosity_.reference);
+    if (porosity_of_law) options.hand_down(porosity_.reference, *porosity_of_law);
     for (std::size_t i = 0; i < laws_.size(); ++i) {
       const std::string law = laws_[i]->name();
       options.group(name(), "law " + law + " (" + laws_[i]->source() + ")", i == chosen_, "-tissue " + law);
