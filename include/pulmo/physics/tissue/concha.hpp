@@ -27,7 +27,8 @@ namespace pulmo {
 /// walls, so the whole stress is that of F less p I exactly; their term stands for that.
 ///
 /// Free of stress at rest. Free inflation has its limit point at J = 4, whatever the parameters: 8.87 cmH2O with these.
-/// No barrier at zero porosity.
+/// No barrier at zero porosity. Where a stretch is below about 0.6 walls can fold out of the mirrors, and the law is
+/// stiffer than the network (docs/effects/laws.md).
 struct Concha {
   static constexpr const char *name = "concha", *alias = "";
   static constexpr const char *source = "Concha & Hurtado 2020; values of Hurtado, Aviles-Rojas & Concha 2023";
