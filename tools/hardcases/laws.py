@@ -1,6 +1,6 @@
 """Hard cases of the tissue laws: collapse, limit points, neutral plateaus, overflow, vanishing stiffness."""
 import numpy as np
-from scipy.optimize import brentq, minimize_scalar
+from scipy.optimize import brentq, minimize, minimize_scalar
 
 from .lab import case, number, pulmo
 
@@ -208,3 +208,32 @@ def soft_volume_control(lab):
             bare = lab.run(vcv + ["-tissue", law])
             lab.demand(f"{law}, the paper's traction", "finished" if bare.finished else "stopped: " + bare.sentence,
                        "finishes, or says where it folds", bare.finished or says_where(bare))
+
+
+def network_of_walls(stretches):
+    """W (kPa) of the unit cell of concha's default parameters: struts and joints, its least over three places."""
+    mu, alpha, d, porosity = 10.33, 10.05, 0.56, 0.69
+    v = (1 - porosity) / (12 - 9 * d)
+
+    def W(s):
+        x, y = stretches + s, np.roll(stretches, -1) - np.roll(s, -1)
+        strut, turn = np.hypot(x, y) / np.sqrt(2), np.arctan2(y, x)
+        return (4 * v * mu * (strut**2 / 2 + 1 / strut - 1.5).sum() + 6 * np.sqrt(2) / np.pi * alpha * mu * v**2 * (
+            2 * np.cos(2 * turn) ** 2 + 4 * (0.5 - np.sin(turn) * np.cos(np.roll(turn, -1))) ** 2).sum())
+    return minimize(W, np.zeros(3), tol=1e-12).fun
+
+
+@case("Walls that fold: tissue of concha is pressed flat", "energy of the unit cell by another minimiser until there; stops where the law has lost its stiffness, and says so")
+def walls(lab):
+    """A block is squeezed along z and pulled along x and y. The walls of its cells are pressed until the cell has two states, to either side,
+    between which stress jumps: no tissue is in equilibrium there."""
+    moved = "0.5*t*x,0.5*t*y,-0.55*t*z"
+    scene = FREE[:-len(pulmo.PINS)] + pulmo.BLOCK + ["-tissue", "concha", "-ts_dt", 0.05, "-support", "-support_surfaces", "x0,x1,y0,y1,z0,z1"]
+    for face in ("x0", "x1", "y0", "y1", "z0", "z1"):
+        scene += [f"-support_displacement_{face}", moved]
+    run = lab.finished(scene + ["-ts_max_time", 0.6], "to stretches of 1.3, 1.3, 0.67")
+    if run:
+        energy = pulmo.columns(run.path("energy.csv"))
+        exact = [network_of_walls(np.array([1 + 0.5 * t, 1 + 0.5 * t, 1 - 0.55 * t])) for t in energy["time_s"]]  # of a litre: J
+        lab.below("error of the stored energy over it", np.abs(energy["elastic_tissue_j"] - exact).max() / exact[-1], 1e-7)
+    lab.stopped(scene + ["-ts_max_time", 1], "The law concha has no stiffness left at this stretch", "concha", what="to 1.5, 1.5, 0.45")
