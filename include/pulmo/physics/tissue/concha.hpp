@@ -209,7 +209,10 @@ private:
             for (int j = 0; j < 3; ++j) B[i][j] = d.second[3 + i][3 + j] + (i == j ? shift : 0);
           return factor(B);
         };
-        while (!shifted()) shift = std::max(2 * shift, joint);
+        while (!shifted()) {
+          shift = std::max(2 * shift, joint);
+          if (!std::isfinite(shift)) return false; // derivatives that overflow
+        }
         for (int i = 0; i < 3; ++i) step[i] = -d.first[3 + i];
         solve(B, step);
         for (int i = 0; i < 3; ++i) {
