@@ -1,6 +1,7 @@
 #include "pulmo/observers/regions.hpp"
 
 #include "pulmo/base/units.hpp"
+#include "pulmo/fem/point_memory.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -30,6 +31,8 @@ PetscErrorCode RegionAudit::setup()
   regions_of_.assign(sampling_.cells().size(), {});
   for (std::size_t r = 0; r < whole; ++r)
     for (PetscInt c : regions_[r].cells) regions_of_[c].push_back(r);
+  for (const RememberedIntegral &integral : model_.composition().integrals())
+    if (!integral.column.empty()) columns_.push_back(integral);
   volumes_.assign(whole + 1, 0);
   for (std::size_t c = 0; c < regions_of_.size(); ++c) {
     regions_of_[c].push_back(whole);
@@ -81,6 +84,29 @@ std::vector<double> RegionAudit::least_porosity(const std::vector<SignalRow> &ro
   return list;
 }
 
+/// Fills the columns of all regions from what effects remember.
+PetscErrorCode RegionAudit::integrate_columns(std::vector<RegionState> &states) const
+{
+  const std::size_t n = columns_.size();
+  std::vector<double> sums(states.size() * n, 0);
+  std::vector<PetscScalar> means;
+
+  PetscFunctionBeginUser;
+  for (std::size_t i = 0; i < n; ++i) {
+    model_.memory()->means(*model_.composition().remembered_in_cells(columns_[i].effect), columns_[i].quantity, means);
+    for (std::size_t c = 0; c < regions_of_.size(); ++c)
+      for (std::size_t r : regions_of_[c]) sums[r * n + i] += sampling_.cells()[c].measure * means[c];
+  }
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, sums.data(), static_cast<PetscMPIInt>(sums.size()), MPI_DOUBLE, MPI_SUM,
+                             PetscObjectComm((PetscObject)model_.dm())));
+  for (std::size_t r = 0; r < states.size(); ++r)
+    for (std::size_t i = 0; i < n; ++i) {
+      const double factor = columns_[i].mean ? 1 / (volumes_[r] * units::mm3_per_ml) : columns_[i].factor;
+      states[r].columns.push_back(factor * sums[r * n + i]);
+    }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode RegionAudit::observe(const StepReport &step)
 {
   const MPI_Comm comm = PetscObjectComm((PetscObject)model_.dm());
@@ -123,6 +149,7 @@ PetscErrorCode RegionAudit::observe(const StepReport &step)
     states[r].mean_pressure = (airway + sum[p1] / V) / units::kPa_per_cmH2O;
     states[r].sd_pressure = spread(sum[p1], sum[p2]) / units::kPa_per_cmH2O;
   }
+  if (!columns_.empty()) PetscCall(integrate_columns(states));
   rows_.push_back(std::move(states));
   if (gas && scene_.tissue().porosity_varies()) PetscCall(follow_porosity(step.local));
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -130,11 +157,16 @@ PetscErrorCode RegionAudit::observe(const StepReport &step)
 
 PetscErrorCode RegionAudit::persist(Archive &archive, Vec)
 {
-  const std::vector<RegionState> empty(volumes_.size());
+  RegionState nothing;
+  nothing.columns.assign(columns_.size(), 0);
+  const std::vector<RegionState> empty(volumes_.size(), nothing);
 
   PetscFunctionBeginUser;
   PetscCall(archive.table("regions", rows_, empty, [](std::vector<RegionState> &row, TableCells &cells) {
-    for (RegionState &s : row) cells(s.volume_change, s.mean_J, s.sd_J, s.mean_pressure, s.sd_pressure);
+    for (RegionState &s : row) {
+      cells(s.volume_change, s.mean_J, s.sd_J, s.mean_pressure, s.sd_pressure);
+      for (double &column : s.columns) cells(column);
+    }
   }));
   if (scene_.facts().airflow && scene_.tissue().porosity_varies())
     PetscCall(

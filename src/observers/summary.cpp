@@ -62,21 +62,32 @@ Json energy_json(const EnergyAudit &audit, const EnergyBalance &balance)
   return json;
 }
 
+/// The columns of effects in a region at a row of the signals.
+Json columns_json(const RegionAudit &audit, std::size_t row, std::size_t region)
+{
+  Json json = Json::object();
+  for (std::size_t i = 0; i < audit.columns().size(); ++i)
+    json[audit.columns()[i].column] = audit.state(row, region).columns[i];
+  return json;
+}
+
 Json regions_json(const RegionAudit &audit, const BreathRows &breath, bool gas)
 {
   Json json = Json::object();
   for (std::size_t r = 0; r < audit.regions().size(); ++r) {
     const RegionState &s = audit.state(breath.fullest, r);
     const auto pressure_json = [gas](double p) { return gas ? Json(p) : Json(nullptr); };
-    json[audit.regions()[r].name] = {{"number", r + 1},
-                                     {"connected_body", audit.regions()[r].body},
-                                     {"reference_volume_ml", audit.volume(r)},
-                                     {"ventilation_ml", audit.ventilation(breath, r)},
-                                     {"ventilation_share", optional_json(audit.ventilation_share(breath, r))},
-                                     {"jacobian_mean", s.mean_J},
-                                     {"jacobian_sd", s.sd_J},
-                                     {"alveolar_pressure_mean_cmH2O", pressure_json(s.mean_pressure)},
-                                     {"alveolar_pressure_sd_cmH2O", pressure_json(s.sd_pressure)}};
+    Json &region = json[audit.regions()[r].name];
+    region = {{"number", r + 1},
+              {"connected_body", audit.regions()[r].body},
+              {"reference_volume_ml", audit.volume(r)},
+              {"ventilation_ml", audit.ventilation(breath, r)},
+              {"ventilation_share", optional_json(audit.ventilation_share(breath, r))},
+              {"jacobian_mean", s.mean_J},
+              {"jacobian_sd", s.sd_J},
+              {"alveolar_pressure_mean_cmH2O", pressure_json(s.mean_pressure)},
+              {"alveolar_pressure_sd_cmH2O", pressure_json(s.sd_pressure)}};
+    region.update(columns_json(audit, breath.fullest, r));
   }
   return json;
 }
@@ -112,8 +123,9 @@ Json diagnosis_json(const Diagnosis &d)
   return json;
 }
 
-/// A trial of several levels of PEEP, with the columns of effects at the last moment of each; null if the run is none.
-Json peep_trial(const Composition &composition, const std::vector<SignalRow> &rows)
+/// A trial of several levels of PEEP, with the columns of effects at the last moment of each, also by region; null if
+/// the run is none.
+Json peep_trial(const Composition &composition, const RegionAudit &audit, const std::vector<SignalRow> &rows)
 {
   const std::vector<PeepLevel> levels = peep_levels(rows);
   const PeepLevel *best = best_compliance(levels);
@@ -128,6 +140,9 @@ Json peep_trial(const Composition &composition, const std::vector<SignalRow> &ro
                 {"compliance_ml_per_cmH2O", optional_json(level.compliance)},
                 {"end_expiratory_volume_ml", end.volume}};
     for (const SignalSpec &signal : composition.signals()) one[signal.name] = signal.value(end);
+    if (!audit.columns().empty())
+      for (std::size_t r = 0; r < audit.regions().size(); ++r)
+        one["regions"][audit.regions()[r].name] = columns_json(audit, level.last, r);
     json["levels"].push_back(one);
   }
   return json;
@@ -235,7 +250,7 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
       json["steady_change"] = unsteady ? Json(unsteady->change) : Json(nullptr);
       json["unsettled_volume_ml"] = optional_json(unsettled_volume(rows));
       json["static_curve"] = static_curve(rows);
-      json["peep_trial"] = peep_trial(model.composition(), rows);
+      json["peep_trial"] = peep_trial(model.composition(), audits.regions, rows);
       json["breaths"] = Json::array();
       for (const BreathRows &b : breath_rows(rows)) {
         Json breath = breath_json(rows, b, frc);

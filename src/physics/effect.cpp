@@ -1,6 +1,8 @@
 // What the effects of a scene put together: the constants that their kernels read.
 #include "pulmo/physics/effect.hpp"
 
+#include "pulmo/mesh/mesh.hpp"
+
 #include <algorithm>
 #include <functional>
 
@@ -50,6 +52,11 @@ void Composition::remember(std::vector<Quantity> quantities, Callback<MemoryFunc
     if (!m.surface.empty() && !surface.empty() && same_owner(m.owner, value.owners[0])) offset = m.offset;
   memories_.push_back({effect_, surface, value.owners[0], std::move(quantities), value.function, nullptr, offset});
   note_readers(effect_, "memory", surface, value.owners);
+}
+
+void Composition::average(std::size_t quantity, const std::string &name)
+{
+  column_of({effect_, quantity, 1 / mesh_.volume(), Over::cells, name, true});
 }
 
 PetscInt Composition::memory_width(const std::string &surface) const

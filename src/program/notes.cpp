@@ -191,7 +191,7 @@ PetscErrorCode check_permeability(MPI_Comm comm, const Scene &scene, const Model
 
   PetscFunctionBeginUser;
   if (!scene.facts().airflow) PetscFunctionReturn(PETSC_SUCCESS);
-  PetscCall(permeability_at_rest(scene.airflow().permeability(), model, k));
+  PetscCall(permeability_at_rest(scene.facts(), model, k));
   const PetscReal bound = most * L * L / (model.modulus() * dt);
   PulmoUserCheck(k.largest <= bound, comm,
                  "-airflow_permeability %g mm^2/(kPa s) is so large that the flow is lost in rounding; give less than "
@@ -276,7 +276,7 @@ PetscErrorCode warn_of_equal_order(MPI_Comm comm, const Scene &scene, const Mode
   PetscFunctionBeginUser;
   if (warned || !facts.airflow || facts.pressure_damping || elements.displacement_degree > elements.pressure_degree)
     PetscFunctionReturn(PETSC_SUCCESS);
-  PetscCall(permeability_at_rest(scene.airflow().permeability(), model, k));
+  PetscCall(permeability_at_rest(scene.facts(), model, k));
   warned = k.least * model.modulus() * dt < half_edge * half_edge;
   if (warned)
     PetscCall(

@@ -250,7 +250,7 @@ PetscErrorCode Simulation::end_unsolved(const std::string &what, const std::stri
 
   PetscFunctionBeginUser;
   PetscCall(options_.loosened(cause));
-  if (scene_.facts().airflow) PetscCall(permeability_at_rest(scene_.airflow().permeability(), model_, k));
+  if (scene_.facts().airflow) PetscCall(permeability_at_rest(scene_.facts(), model_, k));
   const PetscReal spread = k.largest * model_.modulus() * wanted_dt_ / (L * L);
   if (spread > fast_gas) {
     std::ostringstream text;

@@ -1,5 +1,5 @@
 /// @file
-/// The permeability of a lung at rest: its least and largest value over the cells.
+/// The permeability of a lung at rest: its largest value over the cells, and the least that effects may leave of it.
 #pragma once
 
 #include "pulmo/fem/model.hpp"
@@ -11,6 +11,6 @@ struct PermeabilityRange {
 };
 
 /// Collective.
-PetscErrorCode permeability_at_rest(const PermeabilityLaw &law, const Model &model, PermeabilityRange &range);
+PetscErrorCode permeability_at_rest(const SceneFacts &facts, const Model &model, PermeabilityRange &range);
 
 } // namespace pulmo

@@ -1,5 +1,6 @@
 /// @file
-/// The lung part by part: volume, deformation and alveolar pressure of the whole, of each body and of each named part.
+/// The lung part by part: volume, deformation, alveolar pressure and what effects remember, of the whole, of each body
+/// and of each named part.
 #pragma once
 
 #include "pulmo/fem/sampling.hpp"
@@ -15,6 +16,7 @@ struct RegionState {
   double volume_change = 0; ///< int (J - 1), ml
   double mean_J = 1, sd_J = 0;
   double mean_pressure = 0, sd_pressure = 0; ///< alveolar, cmH2O (without airflow: the uniform gas pressure)
+  std::vector<double> columns;               ///< RegionAudit::columns()
 };
 
 /// Follows all regions over the accepted steps.
@@ -32,6 +34,8 @@ public:
   const std::vector<Mesh::Region> &regions() const { return regions_; }
   /// Reference volume of a region, ml.
   double volume(std::size_t region) const { return volumes_[region]; }
+  /// Columns of the signals that are told region by region, too.
+  const std::vector<RememberedIntegral> &columns() const { return columns_; }
   /// State of a region at a row of the signals.
   const RegionState &state(std::size_t row, std::size_t region) const { return rows_[row][region]; }
   /// What a region took in from the start of a breath to the end of inspiration, ml.
@@ -55,6 +59,7 @@ private:
   /// The porosity at rest of a cell.
   Porosity porosity(PetscInt cell) const;
   PetscErrorCode follow_porosity(Vec local);
+  PetscErrorCode integrate_columns(std::vector<RegionState> &states) const;
 
   const Scene &scene_;
   const Model &model_;
@@ -62,6 +67,7 @@ private:
   double breath_end_ = 0;              ///< of the breath at hand, s
   double air_ = 0;                     ///< ml, at rest
   std::vector<double> least_porosity_; ///< [row], where parts of the lung have porosities of their own
+  std::vector<RememberedIntegral> columns_;
   std::vector<Mesh::Region> regions_;
   std::vector<std::vector<std::size_t>> regions_of_; ///< [cell]; the last entry of a row stands for the whole lung
   std::vector<double> volumes_;

@@ -170,6 +170,8 @@ struct RememberedIntegral {
   std::size_t quantity; ///< number among those of the effect
   PetscReal factor;     ///< of mm^3, mm^2 or 1, times the quantity's unit
   Over over = Over::cells;
+  std::string column; ///< of the signals, which the summary has region by region, too; empty: none
+  bool mean = false;  ///< over the lung's volume, and over that of a region
 };
 
 /// The largest value of a column in @p rows.
@@ -287,17 +289,26 @@ public:
   /// Model::build().
   void begin_with(std::shared_ptr<const std::vector<PetscScalar>> start) { memories_.back().start = std::move(start); }
   const std::vector<MemorySpec> &memories() const { return memories_; }
+  /// What @p effect remembers in the cells; null: nothing.
+  const MemorySpec *remembered_in_cells(const std::string &effect) const
+  {
+    for (const MemorySpec &spec : memories_)
+      if (spec.effect == effect && spec.surface.empty()) return &spec;
+    return nullptr;
+  }
   /// Adds a column to the signals: the integral over the lung of quantity @p quantity of those that the effect which
   /// speaks remembers in the cells, times @p factor.
   void integrate(std::size_t quantity, const std::string &name, PetscReal factor)
   {
-    signal(name, [i = sum_up(quantity, Over::cells, factor)](const SignalRow &row) { return row.integrals[i]; });
+    column_of({effect_, quantity, factor, Over::cells, name, false});
   }
+  /// The same of its mean over the lung.
+  void average(std::size_t quantity, const std::string &name);
   /// Which of SignalRow::integrals is quantity @p quantity @p over the places where the effect remembers it, times @p
   /// factor.
   std::size_t sum_up(std::size_t quantity, Over over, PetscReal factor)
   {
-    integrals_.push_back({effect_, quantity, factor, over});
+    integrals_.push_back({effect_, quantity, factor, over, "", false});
     return integrals_.size() - 1;
   }
   const std::vector<RememberedIntegral> &integrals() const { return integrals_; }
@@ -411,6 +422,11 @@ private:
   PetscInt constant_blocks() const
   {
     return static_cast<PetscInt>(1 + parameters_.size() + (memories_.empty() ? 0 : memories_.size() + 1));
+  }
+  void column_of(RememberedIntegral integral)
+  {
+    signal(integral.column, [i = integrals_.size()](const SignalRow &row) { return row.integrals[i]; });
+    integrals_.push_back(std::move(integral));
   }
   /// Whether a term resists displacement itself.
   static bool resists(const Term &t)
@@ -557,9 +573,13 @@ struct SceneFacts {
   const TissueLaw *law = nullptr;                ///< of the tissue
   std::vector<StressFreeFunction> stress_free;   ///< where it is free of stress, if not in the shape of the mesh
   StressByPressure stress_by_pressure = nullptr; ///< how its stress depends on the gas pressure, if it does
+  /// dp/dJ that films of constant tension add in uniform inflation, kPa; null: there are none.
+  PetscReal (*film_stiffness)(PetscReal J, const PetscScalar constants[]) = nullptr;
   bool airflow = false;                          ///< the pressure field exists
   bool porosity = false;                         ///< a kernel or an observer reads the tissue's porosity (Porosity)
   const PermeabilityLaw *permeability = nullptr; ///< that the gas flows by; null without airflow
+  /// The least share of that permeability that a place may be left with; null: all of it.
+  PetscReal (*least_permeability)(const PetscScalar constants[]) = nullptr;
   std::optional<GravityFacts> gravity;
   bool inertia = false; ///< tissue and air have mass
   std::optional<PrestressFacts> prestress;

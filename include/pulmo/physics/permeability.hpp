@@ -75,6 +75,17 @@ struct GasForceCallbacks {
   Callback<EnergyDensity> heat;                 ///< by which the heat of the flow differs from that of -grad p alone
 };
 
+/// A law's kernels for those of other effects (DarcyKernels), with all parameters in Point::constants; they add to what
+/// they are given.
+struct FluxFunctions {
+  using Function = void (*)(const Point &, PetscScalar to[]);
+  using Energy = PetscScalar (*)(const Point &);
+  Function flux, flux_by_displacement, flux_by_pressure;
+  Energy dissipation;
+  Function force_flux, force_flux_by_displacement; ///< of GasForce
+  Energy force_work, force_heat;
+};
+
 /// The flux kernels of airflow with permeability law @p Law; see effects/airflow.hpp.
 template <class Law>
 struct DarcyKernels;
@@ -95,6 +106,7 @@ public:
   virtual Callback<PetscPointJac> flux_by_pressure_callback() const = 0;
   virtual Callback<EnergyDensity> dissipation_callback() const = 0;
   virtual GasForceCallbacks gas_force_callbacks() const = 0;
+  virtual FluxFunctions functions() const = 0;
 };
 
 template <class Law>
@@ -135,8 +147,31 @@ public:
     return {volume_residual<P, Kernels::force_flux>, volume_jacobian<P, Kernels::force_flux_by_displacement>,
             energy_density<P, Kernels::force_work>, energy_density<P, Kernels::force_heat>};
   }
+  FluxFunctions functions() const override
+  {
+    using P = Both<Parameters, GasForce>;
+    return {function<Parameters, Kernels::flux>,
+            function<Parameters, Kernels::flux_by_displacement>,
+            function<Parameters, Kernels::flux_by_pressure>,
+            energy<Parameters, Kernels::dissipation>,
+            function<P, Kernels::force_flux>,
+            function<P, Kernels::force_flux_by_displacement>,
+            energy<P, Kernels::force_work>,
+            energy<P, Kernels::force_heat>};
+  }
 
 private:
+  template <class P, Kernel<P> K>
+  static void function(const Point &point, PetscScalar to[])
+  {
+    K(point, constants::get<P>(point.constants), to);
+  }
+  template <class P, EnergyKernel<P> K>
+  static PetscScalar energy(const Point &point)
+  {
+    return K(point, point, constants::get<P>(point.constants));
+  }
+
   typename Law::Parameters parameters_;
 };
 

@@ -4,10 +4,13 @@
 By hand: tests/verification/recruitment/recruitment_test.py build/pulmo
 """
 import os
+import re
+import subprocess
 import sys
 import unittest
 
 import h5py
+import meshio
 import numpy as np
 from scipy.optimize import brentq
 
@@ -92,6 +95,39 @@ class FreeTissue(unittest.TestCase):
             self.assertGreater(observed.min(), order - 0.3)
 
 
+class ManyUnits(unittest.TestCase):
+    """Each cell of a block opens at a pressure of its own while the pressure rises: the mean share in closed form."""
+
+    @classmethod
+    def setUpClass(cls):
+        mesh = meshio.read(pulmo.mesh("cube_coarse.msh"))
+        corners = mesh.points[mesh.cells_dict["tetra"]]
+        cls.volume = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1]))
+        cls.opening = np.linspace(4, 12, len(cls.volume))
+        cls.file = pulmo.scratch("opening.h5")
+        with h5py.File(cls.file, "w") as file:
+            file["p"] = cls.opening
+
+    def orders(self, scheme, rate):
+        """Errors of the mean share at the end of a ramp to 16 cmH2O in 1 s, and their orders."""
+        share = np.minimum(rate * 16 * (1 - self.opening / 16) ** 2 / 2, 1)
+        exact, errors = np.average(share, weights=self.volume), []
+        for dt in (0.07, 0.035, 0.0175):
+            rows = pulmo.finished(FREE + scheme + ["-recruitment_opening_pressure", self.file + ":p", "-recruitment_opening_rate", rate,
+                                                   "-ts_dt", dt] + pulmo.programme("rise 1 pressure 16 ramp 1\n")).signals()
+            errors.append(abs(rows["open_share"][-1] - exact))
+        orders = np.log2(np.array(errors[:-1]) / errors[1:])
+        print(f"\nrate {rate}, {scheme or 'backward Euler'}: errors of the mean share {errors}, orders {orders}, open at the end {np.sum(share == 1)} of {len(share)}")
+        return orders
+
+    def test_order_while_many_open(self):
+        self.assertGreater(self.orders([], 0.2).min(), 0.7)
+        self.assertGreater(self.orders(["-ts_type", "bdf"], 0.2).min(), 1.7)
+
+    def test_order_where_many_have_opened(self):
+        self.assertGreater(self.orders(["-ts_type", "bdf"], 0.6).min(), 1.7)  # 14 of 24 cells
+
+
 class Lung(unittest.TestCase):
     def test_parts_have_thresholds_of_their_own(self):
         """One lung opens, the other does not; air goes where it opens."""
@@ -113,12 +149,119 @@ class Lung(unittest.TestCase):
         most = sorted(open_share[region == n].max() for n in numbers)
         self.assertEqual(most[0], 0)
         self.assertGreater(most[1], 0.05)
+        left, right = (whole["regions"][name] for name in ("left_lung", "right_lung"))
+        self.assertEqual((left["open_share"], left["recruited_volume_ml"]), (0, 0))
+        at = np.abs(rows["recruited_volume_ml"] - right["recruited_volume_ml"]).argmin()  # the whole is the sum of its parts, at one time
+        self.assertAlmostEqual(right["recruited_volume_ml"], rows["recruited_volume_ml"][at], delta=1e-9)
+        self.assertAlmostEqual(share * right["open_share"], rows["open_share"][at], delta=1e-12)
+        self.assertGreater(right["recruited_volume_ml"], 1)
 
     def test_thresholds_of_a_part_are_checked(self):
         run = pulmo.Case(["-dm_plex_filename", pulmo.mesh("lung_pair.msh")] + pulmo.options_file("scenes/pcv.opts") + pulmo.DIRECT + [
             "-recruitment", "-recruitment_closing_pressure", "4,left_lung=20"])
         self.assertEqual(run.code, 1)
         self.assertIn("-recruitment_closing_pressure is above -recruitment_opening_pressure in some part", run.err)
+
+
+class ClosedAirspacesResist(unittest.TestCase):
+    """-recruitment_permeability in a breath in which airspaces open and close, with weight: the gas bears a force then."""
+    SCENE = (pulmo.options_file("scenes/pcv.opts") + pulmo.TIGHT + pulmo.QUIET + pulmo.LUNG + [
+        "-elements", "P1-P1", "-tissue", "patte", "-airflow_permeability", "1e3", "-airflow_permeability_law", "exponential", "-gravity",
+        "-tissue_porosity", "0.75", "-chest_wall_direction", "normal", "-ventilator_pip", "8", "-ventilator_inspiration", "0.2",
+        "-ventilator_expiration", "0.2", "-ventilator_settle", "off", "-ventilator_ramp_down", "0.1", "-ts_dt", "0.05", "-recruitment",
+        "-recruitment_opening_pressure", "1.5", "-recruitment_closing_pressure", "1", "-recruitment_opening_rate", "4", "-recruitment_start", "0.2"])
+    SLOW = ["-recruitment_permeability", "0.1"]
+
+    def test_energy_gas_restart_ranks(self):
+        whole = pulmo.finished(self.SCENE + self.SLOW + ["-checkpoint_every", "0.2"])
+        rows, numbers = whole.signals(), whole.json()
+        self.assertGreater(np.ptp(rows["open_share"]), 0.1)
+        self.assertLess(abs(numbers["energy_j"]["residual_relative"]), 1e-9)
+        self.assertLess(abs(numbers["mass_balance_error_ml"]), 1e-6)
+        self.assertLess(numbers["newton_iterations"], 6 * numbers["steps"])  # the tangent knows dx/dp
+        others = [pulmo.finished(self.SCENE + self.SLOW, ranks=2), pulmo.finished(self.SCENE + self.SLOW + ["-petscfe_type", "basic"]),
+                  pulmo.finished(self.SCENE + self.SLOW + ["-restart", whole.path("checkpoint_previous.h5")])]
+        for other in others:
+            for name in ("volume_ml", "open_share"):
+                np.testing.assert_allclose(other.signals()[name], rows[name], atol=1e-8 * np.abs(rows[name]).max())
+        bdf = pulmo.finished(self.SCENE + self.SLOW + ["-ts_type", "bdf"]).signals()
+        self.assertLess(abs(bdf["volume_ml"].max() / rows["volume_ml"].max() - 1), 0.15)
+        # the flow is slower, and with all open it is what it was
+        free = pulmo.finished(self.SCENE).signals()
+        self.assertLess(rows["volume_ml"].max(), 0.95 * free["volume_ml"].max())
+        still = ["-recruitment_opening_pressure", "1e3", "-recruitment_closing_pressure", "-1e3", "-recruitment_start", "1"]
+        a, b = (pulmo.finished(self.SCENE + still + more).signals() for more in (self.SLOW, []))
+        np.testing.assert_allclose(a["volume_ml"], b["volume_ml"], atol=1e-9 * b["volume_ml"].max())
+
+    def test_needs_gas_that_flows(self):
+        run = pulmo.Case(FREE + self.SLOW + pulmo.programme(UP_AND_DOWN))
+        self.assertEqual(run.code, 1)
+        self.assertIn("-recruitment_permeability needs gas that flows: give -airflow", run.err)
+
+
+class Trial(unittest.TestCase):
+    """A short form of scenes/ards_peep_trial.opts: on lung_test.msh, with its formulas, one breath at each of three levels."""
+    SCENE = os.path.join(pulmo.SOURCE, "petsc_options", "scenes", "ards_peep_trial.opts")
+    LEVELS = (20, 11, 2)
+
+    @classmethod
+    def values_for(cls, mesh, file):
+        with open(cls.SCENE) as scene:
+            formulas = re.findall(r'"(\w+=[^"]*)"', scene.read())
+        subprocess.run([os.path.join(pulmo.SOURCE, "tools", "cell_values"), mesh, file, *formulas], check=True, stdout=subprocess.DEVNULL)
+        return [formula.partition("=")[0] for formula in formulas]
+
+    @classmethod
+    def setUpClass(cls):
+        values = pulmo.scratch("values.h5")
+        cls.values_for(pulmo.mesh("lung_test.msh"), values)
+
+        def run(*phases):
+            return pulmo.finished(pulmo.options_file("solvers/reuse.opts") + pulmo.options_file("scenes/ards_peep_trial.opts") + pulmo.QUIET + [
+                *pulmo.LUNG, "-elements", "P1-P1", "-ts_dt", "0.5", "-airflow_permeability", values + ":k",
+                "-recruitment_opening_pressure", values + ":opening", "-recruitment_closing_pressure", values + ":closing",
+                "-recruitment_start", values + ":start"] + pulmo.programme("".join(phases)))
+
+        def level(p):
+            return (f"expiration 2.5 pressure {p} ramp 0.5\ninspiration 1 pressure {p + 10} ramp 0.5\n"
+                    f"expiration 1.5 pressure {p} ramp 0.5\n")
+        cls.down = run("settle 0.5 pressure 0\n", "recruit 3 pressure 35 ramp 1\n", *map(level, cls.LEVELS))
+        cls.up = run("settle 0.5 pressure 0\n", *map(level, cls.LEVELS[::-1]))
+
+    def test_values_of_the_scene_are_those_of_its_formulas(self):
+        made = pulmo.scratch("values.h5")
+        names = self.values_for(pulmo.mesh("lung_pair.msh"), made)
+        self.assertEqual(names, ["k", "opening", "closing", "start"])
+        with h5py.File(made) as a, h5py.File(pulmo.mesh("lung_pair_ards.h5")) as b:
+            for name in names:
+                np.testing.assert_array_equal(a[name][()], b[name][()])
+
+    def test_best_compliance_lies_between_the_levels(self):
+        """Below, airspaces are closed; above, tissue is stretched until it stiffens."""
+        trial = self.down.json()["peep_trial"]
+        levels = trial["levels"]
+        np.testing.assert_allclose([level["peep_cmH2O"] for level in levels], self.LEVELS, atol=1e-9)
+        self.assertAlmostEqual(trial["peep_of_best_compliance_cmH2O"], self.LEVELS[1], delta=1e-9)
+        best = trial["best_compliance_ml_per_cmH2O"]
+        for level in (levels[0], levels[2]):
+            self.assertLess(level["compliance_ml_per_cmH2O"], 0.95 * best)
+        shares = [level["open_share"] for level in levels]
+        self.assertGreater(shares[1], 0.9 * shares[0])  # what closes, closes below the best level
+        self.assertLess(shares[2], 0.6 * shares[1])
+
+    def test_more_is_open_on_the_way_down(self):
+        down = self.down.json()["peep_trial"]["levels"]
+        up = self.up.json()["peep_trial"]["levels"][::-1]
+        for p, after, before in zip(self.LEVELS, down, up):
+            self.assertAlmostEqual(before["peep_cmH2O"], p, delta=1e-9)
+            self.assertGreaterEqual(after["open_share"], before["open_share"] - 1e-12)
+        for level in range(2):
+            self.assertGreater(down[level]["recruited_volume_ml"], 1.1 * up[level]["recruited_volume_ml"])
+
+    def test_levels_by_region(self):
+        for level in self.down.json()["peep_trial"]["levels"]:
+            for name in ("open_share", "recruited_volume_ml"):
+                self.assertAlmostEqual(sum(r[name] for r in level["regions"].values()), level[name], delta=1e-9)  # one body
 
 
 if __name__ == "__main__":

@@ -7,7 +7,8 @@
 /// is open takes up its volume without stress: the stress-free state grows by J_r = (1 + a x) / (1 + a x_0), and the
 /// energy per volume of the mesh is J_r W(F J_r^(-1/3)). Air is J - 1 + Phi0 as ever, so mass is conserved as ever. The
 /// rate is that of the time scheme, at the end of the step, and x is clipped then; where it is not, x depends on p, and
-/// so does the stress.
+/// so does the stress. Through airspaces that are closed less gas may flow: the permeability is that of the airflow
+/// times eps + (1 - eps) x, which takes the flux -(1 - eps) (1 - x) Q away.
 #pragma once
 
 #include "pulmo/base/units.hpp"
@@ -36,6 +37,7 @@ struct RecruitmentKernels {
   static Share open(const Point &point, const Parameters &k)
   {
     if (!point.memory.last) return {k.start, 0};
+    if (point.step.last_weight == 0) return {point.memory.last[0], 0}; // no step: TimeScheme asks for the gas at hand
     const auto suction = constants::to_pointer<decltype(SceneFacts::pleural_suction)>(k.suction);
     const PetscScalar pull = k.prestress + (suction ? suction(point.t, point.constants) : 0),
                       p = (point.gas_pressure() + pull) / units::kPa_per_cmH2O, a = point.step.slope;
@@ -92,6 +94,77 @@ struct RecruitmentKernels {
   }
 };
 
+/// What closed airspaces take away from the flux of airflow.
+struct ClosedFlowKernels {
+  struct Flow {
+    static constexpr const char *owner = "recruitment_flow";
+    PetscScalar permeability = 1; ///< eps, share of the permeability that is left where all is closed
+    // FluxFunctions, as constants::to_scalar() packs them; those of a force on the gas are 0 where there is none
+    PetscScalar flux = 0, flux_by_displacement = 0, flux_by_pressure = 0, dissipation = 0;
+    PetscScalar force_flux = 0, force_flux_by_displacement = 0, force_work = 0, force_heat = 0;
+  };
+  using Parameters = Both<RecruitmentKernels::Parameters, Flow>;
+
+  /// -(1 - eps) (1 - x), and its derivative by p, 1/kPa.
+  struct Missing {
+    PetscScalar share, by_p;
+  };
+  static Missing missing(const Point &point, const Parameters &k)
+  {
+    const RecruitmentKernels::Share open = RecruitmentKernels::open(point, k.own);
+    const PetscScalar closed = 1 - k.other.permeability;
+    return {-closed * (1 - open.x), closed * open.dx_dp};
+  }
+
+  static void flux(const Point &point, const Parameters &k, PetscScalar f1[])
+  {
+    add<3>(missing(point, k).share, {k.other.flux, k.other.force_flux}, point, f1);
+  }
+  static void flux_by_displacement(const Point &point, const Parameters &k, PetscScalar g3[])
+  {
+    add<27>(missing(point, k).share, {k.other.flux_by_displacement, k.other.force_flux_by_displacement}, point, g3);
+  }
+  static void flux_by_pressure(const Point &point, const Parameters &k, PetscScalar g3[])
+  {
+    add<9>(missing(point, k).share, {k.other.flux_by_pressure, 0}, point, g3);
+  }
+  /// g2 of (mass, pressure), by way of x.
+  static void flux_by_share(const Point &point, const Parameters &k, PetscScalar g2[])
+  {
+    add<3>(missing(point, k).by_p, {k.other.flux, k.other.force_flux}, point, g2);
+  }
+  /// Heat of the flow, and work of a force on it, that there is not.
+  static PetscScalar heat(const Point &now, const Point &, const Parameters &k)
+  {
+    return missing(now, k).share * sum({k.other.dissipation, k.other.force_heat}, now);
+  }
+  static PetscScalar work(const Point &now, const Point &, const Parameters &k)
+  {
+    return missing(now, k).share * sum({k.other.force_work, 0}, now);
+  }
+
+private:
+  using Functions = std::array<PetscScalar, 2>;
+
+  /// Adds @p share of what the functions say.
+  template <int n>
+  static void add(PetscScalar share, const Functions &functions, const Point &point, PetscScalar to[])
+  {
+    if (share == 0) return;
+    PetscScalar whole[n] = {0};
+    for (const PetscScalar f : functions)
+      if (const auto function = constants::to_pointer<FluxFunctions::Function>(f)) function(point, whole);
+    for (int i = 0; i < n; ++i) to[i] += share * whole[i];
+  }
+  static PetscScalar sum(const Functions &functions, const Point &point)
+  {
+    PetscScalar all = 0;
+    for (const PetscScalar f : functions)
+      if (const auto function = constants::to_pointer<FluxFunctions::Energy>(f)) all += function(point);
+    return all;
+  }
+};
+
 class Recruitment final : public Effect {
 public:
   const char *name() const override { return "recruitment"; }
@@ -124,6 +197,10 @@ public:
     PetscCall(options.real("gain", "-", Range::not_negative(),
                            "volume that the tissue gains when all airspaces open, over that with all closed", k.gain));
     PetscCall(options.real("start", "-", Range::between(0, 1), "share that is open in the shape of the mesh", k.start));
+    PetscCall(options.real("permeability", "-", Range::between(1e-6, 1),
+                           "share of the permeability that is left where all airspaces are closed; 1: all of it",
+                           flow_.permeability));
+    slows_ = flow_.permeability != 1 || options.varies(flow_.permeability);
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
@@ -131,6 +208,10 @@ public:
   {
     facts.stress_free.push_back(RecruitmentKernels::stress_free);
     facts.stress_by_pressure = RecruitmentKernels::stress_by_pressure;
+    if (slows_)
+      facts.least_permeability = [](const PetscScalar c[]) -> PetscReal {
+        return constants::get<ClosedFlowKernels::Flow>(c).permeability;
+      };
     return PETSC_SUCCESS;
   }
 
@@ -139,6 +220,8 @@ public:
     PetscFunctionBeginUser;
     PulmoUserCheck(facts.airflow || facts.ventilator, options.comm(),
                    "-recruitment needs a gas pressure: give -ventilator, -airflow or both");
+    PulmoUserCheck(facts.airflow || !slows_, options.comm(),
+                   "-recruitment_permeability needs gas that flows: give -airflow, or leave it out");
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
@@ -162,16 +245,42 @@ public:
          "-recruitment_closing_pressure is above -recruitment_opening_pressure in some part of the lung (or all of "
          "it): between the two airspaces would open and close at once; give that part a lower one"});
     c.remember({{"open_share", "1"}, {"recruited_volume", "1"}}, remembered<P, K::remember>);
-    c.integrate(0, "open_share", 1 / c.mesh().volume());
+    c.average(0, "open_share");
     c.integrate(1, "recruited_volume_ml", 1 / units::mm3_per_ml);
     if (facts.airflow) c.jacobian("dP'/dp", displacement, pressure, g2(volume_jacobian<P, K::tangent_by_pressure>));
     c.energy(Energy::dissipated, "recruitment", "", facts.law->callbacks(true).released);
+    if (slows_) flow_terms(c, facts);
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
 private:
-  bool on_ = false;
+  void flow_terms(Composition &c, const SceneFacts &facts) const
+  {
+    using K = ClosedFlowKernels;
+    using P = K::Parameters;
+    const FluxFunctions law = facts.permeability->functions();
+    flow_.flux = constants::to_scalar(law.flux);
+    flow_.flux_by_displacement = constants::to_scalar(law.flux_by_displacement);
+    flow_.flux_by_pressure = constants::to_scalar(law.flux_by_pressure);
+    flow_.dissipation = constants::to_scalar(law.dissipation);
+    if (facts.gravity) { // which brings a force on the gas
+      flow_.force_flux = constants::to_scalar(law.force_flux);
+      flow_.force_flux_by_displacement = constants::to_scalar(law.force_flux_by_displacement);
+      flow_.force_work = constants::to_scalar(law.force_work);
+      flow_.force_heat = constants::to_scalar(law.force_heat);
+    }
+    c.parameters(flow_);
+    c.residual("(1 - eps) (1 - x) Q . Grad q", pressure, f1(volume_residual<P, K::flux>));
+    c.jacobian("flux of the closed", pressure, displacement, g3(volume_jacobian<P, K::flux_by_displacement>));
+    c.jacobian("flux of the closed", pressure, pressure, g2(volume_jacobian<P, K::flux_by_share>),
+               g3(volume_jacobian<P, K::flux_by_pressure>));
+    c.energy(Energy::dissipated, "resistive", "", energy_density<P, K::heat>);
+    if (facts.gravity) c.energy(Energy::external, "external", "", energy_density<P, K::work>);
+  }
+
+  bool on_ = false, slows_ = false; ///< slows_: what is closed lets less gas through
   mutable RecruitmentKernels::Parameters parameters_;
+  mutable ClosedFlowKernels::Flow flow_;
 };
 
 } // namespace pulmo
