@@ -137,8 +137,12 @@ PetscErrorCode look_at_tissue(const Scene &scene, const Model &model, Vec local,
   make_point_state(mean, nullptr, state);
   d.acoustic = acoustic_stiffness(law, state, true, all_over.data()).least;
   d.acoustic_lost = lost(d.acoustic, d.acoustic_at_rest);
-  d.inflation = inflation_stiffness(law, d.mean_J, all_over.data());
-  d.inflation_lost = lost(d.inflation, inflation_stiffness(law, 1, all_over.data()));
+  const auto inflation = [&](PetscReal J) {
+    const auto film = scene.facts().film_stiffness;
+    return inflation_stiffness(law, J, all_over.data()) + (film ? film(J, all_over.data()) : 0);
+  };
+  d.inflation = inflation(d.mean_J);
+  d.inflation_lost = lost(d.inflation, inflation(1));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -194,7 +198,8 @@ std::string why(const Scene &scene, const FailureFacts &facts, const Diagnosis &
          << " mm from the edge of the airway, within two cells.";
     break;
   case Diagnosis::Kind::everywhere:
-    text << " Where: everywhere. The law " << law << " has no stiffness left at this stretch: ";
+    text << " Where: everywhere. The law " << law << (scene.facts().film_stiffness ? ", with its film," : "")
+         << " has no stiffness left at this stretch: ";
     stiffness();
     break;
   case Diagnosis::Kind::inside:

@@ -48,7 +48,7 @@ struct Diagnosis {
   std::optional<Measures> worst;     ///< the cell that turned inside out, or is close to it
   std::optional<PetscReal> from_rim; ///< its distance from the edge of the airway, mm
   PetscReal mean_J = 1;              ///< of the last good state
-  PetscReal inflation = 0;           ///< inflation_stiffness() there, kPa
+  PetscReal inflation = 0;           ///< dp/dJ of uniform inflation there, kPa
   PetscReal acoustic = 0;         ///< acoustic_stiffness() of the mean deformation gradient of the last good state, kPa
   PetscReal acoustic_at_rest = 0; ///< the same at rest, kPa
   bool inflation_lost = false, acoustic_lost = false; ///< next to nothing of them is left

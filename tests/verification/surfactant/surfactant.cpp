@@ -70,9 +70,9 @@ struct Result {
   std::string printed;
 };
 
-void breathe(const std::function<double(double)> &J, const std::string &law, const std::string &more, Result &result)
+void drive(const Motion &motion, const std::string &law, const std::string &more, Result &result)
 {
-  const Registry r = driven([&J](double t) { return inflated(J(t)); });
+  const Registry r = driven(motion);
   pulmo::Run run(r);
   bool finished = false;
   result = {};
@@ -96,6 +96,32 @@ void breathe(const std::function<double(double)> &J, const std::string &law, con
   for (std::size_t i = 0; i < energy.accounts().size(); ++i)
     result.energy[energy.accounts()[i].name] = energy.rows().back().accounts[i];
   result.share = energy.worst_share();
+}
+
+void breathe(const std::function<double(double)> &J, const std::string &law, const std::string &more, Result &result)
+{
+  drive([&J](double t) { return inflated(J(t)); }, law, more, result);
+}
+
+/// Matrices by rows.
+using Matrix = std::array<double, 9>;
+
+Matrix product(const Matrix &a, const Matrix &b)
+{
+  Matrix c{};
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j)
+      for (int k = 0; k < 3; ++k) c[3 * i + j] += a[3 * i + k] * b[3 * k + j];
+  return c;
+}
+
+/// By Rodrigues, about an axis askew.
+Matrix rotation(double angle)
+{
+  const double n[3] = {2.0 / 7, 3.0 / 7, 6.0 / 7}, c = std::cos(angle), s = std::sin(angle);
+  return {c + n[0] * n[0] * (1 - c),        n[0] * n[1] * (1 - c) - n[2] * s, n[0] * n[2] * (1 - c) + n[1] * s,
+          n[1] * n[0] * (1 - c) + n[2] * s, c + n[1] * n[1] * (1 - c),        n[1] * n[2] * (1 - c) - n[0] * s,
+          n[2] * n[0] * (1 - c) - n[1] * s, n[2] * n[1] * (1 - c) + n[0] * s, c + n[2] * n[2] * (1 - c)};
 }
 
 /// gamma of a row, from the stress beyond the law's: P = (W' + p_gamma - p_rest) J^(2/3), mN/m.
@@ -130,6 +156,36 @@ TEST(Surfactant, ComesBackAfterAFastStretchHoweverLargeTheSteps)
     EXPECT_NEAR(tension(f, "yoshihara", at, r.history.P[n][0]), 23 + 140 * 2.0 / 3 * std::log(at), 1e-8) << n;
   }
   EXPECT_LT(r.share, 1e-9);
+}
+
+TEST(Surfactant, TurnsWithTheTissue)
+{
+  // stretch and shear that work the film on all its branches, and the same turned by 3 rad meanwhile: P is that of it,
+  // turned
+  const auto stretch = [](double t) {
+    const double s = std::sin(2 * M_PI * t);
+    return Matrix{1 + 0.25 * s, 0.2 * s, 0, 0, 1 + 0.15 * s, -0.1 * s, 0, 0, 1 - 0.05 * s};
+  };
+  const auto spin = [](double t) { return rotation(3 * t); };
+  const auto less_identity = [](Matrix F) {
+    for (int i = 0; i < 9; i += 4) F[i] -= 1;
+    return F;
+  };
+  for (const std::string more :
+       {"-surfactant_gamma dynamic", "-surfactant_gamma dynamic -ts_type bdf", "-surfactant_gamma constant"}) {
+    Result still, turned;
+    ASSERT_NO_FATAL_FAILURE(
+        drive([&](double t) { return less_identity(stretch(t)); }, "yoshihara", more + steps(1, 40), still));
+    ASSERT_NO_FATAL_FAILURE(drive([&](double t) { return less_identity(product(spin(t), stretch(t))); }, "yoshihara",
+                                  more + steps(1, 40), turned));
+    ASSERT_EQ(still.history.P.size(), 40u);
+    ASSERT_EQ(turned.history.P.size(), 40u);
+    for (std::size_t n = 0; n < 40; ++n) {
+      const Matrix expected = product(spin(turned.history.t[n]), still.history.P[n]);
+      for (std::size_t i = 0; i < 9; ++i)
+        EXPECT_NEAR(turned.history.P[n][i], expected[i], 1e-9) << more << " row " << n;
+    }
+  }
 }
 
 TEST(Surfactant, OrderInTime)

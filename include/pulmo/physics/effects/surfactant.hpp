@@ -67,6 +67,12 @@ struct SurfactantKernels {
   /// p_rest, kPa.
   static PetscScalar at_rest(const Parameters &k) { return 2.0 / 3 * units::kPa_mm_per_mN_m * k.area * k.gamma_eq; }
 
+  /// d(p_gamma)/dJ of a film of constant tension, kPa.
+  static PetscReal stiffness(PetscReal J, const PetscScalar constants[])
+  {
+    return -at_rest(constants::get<Parameters>(constants)) / (3 * J * std::cbrt(J));
+  }
+
   /// f1 = (p_gamma - p_rest) cof F.
   template <bool Dynamic>
   static void stress(const Point &point, const Parameters &k, PetscScalar f1[])
@@ -155,6 +161,12 @@ public:
                            k.expansion));
     PetscCall(options.real("area", "1/mm", Range::not_negative(), "surface per volume at rest, S0", k.area));
     PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+  PetscErrorCode announce(SceneFacts &facts) override
+  {
+    facts.film_stiffness = SurfactantKernels::stiffness;
+    return PETSC_SUCCESS;
   }
 
   PetscErrorCode check(const Options &options, const Mesh &, const SceneFacts &facts) override
