@@ -1,5 +1,6 @@
-"""Hard cases of the tissue's stress-free state: prestress where the law is nearly neutral, airspaces that all open within a step."""
+"""Hard cases of what the tissue rests on: prestress where the law is nearly neutral, airspaces that all open within a step, a film that collapses it."""
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from .lab import case, pulmo
 from .laws import inflated
@@ -52,3 +53,40 @@ def avalanche(lab):
         if run:
             lab.below("energy balance, residual over work", abs(run.json()["energy_j"]["residual_relative"]), 1e-6)
             lab.demand("all is open at the end of inspiration", float(run.signals()["open_share"].max()), "> 0.99", run.signals()["open_share"].max() > 0.99)
+
+
+def with_film(J, gamma):
+    """Pressure (cmH2O) of free tissue, CM3 with a film of constant tension (mN/m) on 30 /mm: W'(J) + p_rest (J^(-1/3) - 1)."""
+    return pulmo.gas_pressure("birzle", J) + 2 / 3 * 30e-3 * gamma * (J ** (-1 / 3) - 1) / pulmo.KPA_PER_CMH2O
+
+
+@case("A film of constant tension on soft tissue: γ collapse", "by volume, the falling branch of the closed form up and down; by pressure, an end at the closed limit point with the "
+      "sentence that says so; warned of before; what springs hold goes on", "the lung")
+def film_collapse(lab):
+    """Without its hysteresis a film pulls less the larger the alveoli are: with 50 mN/m, that of a lung short of surfactant, the pressure of CM3 turns at
+    J = 1.63, 3.1 cmH2O. Beyond, a larger alveolus empties a smaller one, pressure has no equilibrium and volume has one whose stiffness is negative."""
+    gamma = 50
+    on = ["-tissue", "birzle", "-surfactant", "-surfactant_gamma", "constant", "-surfactant_gamma_eq", gamma]
+    top = minimize_scalar(lambda J: -with_film(J, gamma), bounds=(1.05, 2.5), method="bounded", options={"xatol": 1e-10})
+    J_top, p_top = top.x, -top.fun
+    by_volume = lab.finished(FREE + on + pulmo.programme("up 1 flow 1500\ndown 1.2 flow -1500\n"), "by volume to J = 2.5 and 0.7")
+    if by_volume:
+        rows = by_volume.signals()
+        p = np.array([with_film(1 + V / 1000, gamma) for V in rows["volume_ml"]])
+        lab.below("pressure beside the closed form, both branches and J < 1 (cmH2O)", np.abs(rows["airway_pressure_cmH2O"] - p).max(), 1e-6)
+        lab.above("fall of the pressure beyond the turn, J 1.63 to 2.5 (cmH2O)",
+                  rows["airway_pressure_cmH2O"].max() - rows["airway_pressure_cmH2O"][rows["volume_ml"].argmax()], 0.5)
+        lab.true("warned of it", "falls beyond" in by_volume.out)
+        lab.below("energy balance, residual over work", abs(by_volume.json()["energy_j"]["residual_relative"]), 1e-6)
+    by_pressure = lab.stopped(FREE + on + pulmo.programme("up 1 pressure 4 ramp 1\n"), "with its film, has no stiffness left",
+                              "a limit point. There is no equilibrium above", what="by pressure to 4 cmH2O: film and limit point are named")
+    if by_pressure:
+        rows = by_pressure.signals(by_pressure.signals_file)
+        lab.within("where it ends (cmH2O)", rows["airway_pressure_cmH2O"].max(), p_top, 1e-3)
+        lab.within("J there", rows["max_J"][-1], J_top, 0.02)
+    if not lab.small:
+        held = lab.finished(pulmo.LUNG + pulmo.PCV + pulmo.DIRECT + on + ["-elements", "P1-P1", "-ventilator_pip", 10, "-ts_max_time", 1.5],
+                            "a breath of 10 cmH2O of the lung on springs")
+        if held:
+            lab.below("the same breath: energy balance, residual over work", abs(held.json()["energy_j"]["residual_relative"]), 1e-6)
+            lab.above("the same breath: largest J, beyond the turn", held.signals()["max_J"].max(), J_top)
