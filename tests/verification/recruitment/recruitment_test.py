@@ -166,7 +166,7 @@ class Lung(unittest.TestCase):
 class ClosedAirspacesResist(unittest.TestCase):
     """-recruitment_permeability in a breath in which airspaces open and close, with weight: the gas bears a force then."""
     SCENE = (pulmo.options_file("scenes/pcv.opts") + pulmo.TIGHT + pulmo.QUIET + pulmo.LUNG + [
-        "-elements", "P1-P1", "-tissue", "patte", "-airflow_permeability", "1e3", "-airflow_permeability_law", "exponential", "-gravity",
+        "-elements", "P1-P1", "-quadrature_degree", "2", "-tissue", "patte", "-airflow_permeability", "1e4", "-airflow_permeability_law", "exponential", "-gravity",
         "-tissue_porosity", "0.75", "-chest_wall_direction", "normal", "-ventilator_pip", "8", "-ventilator_inspiration", "0.2",
         "-ventilator_expiration", "0.2", "-ventilator_settle", "off", "-ventilator_ramp_down", "0.1", "-ts_dt", "0.05", "-recruitment",
         "-recruitment_opening_pressure", "1.5", "-recruitment_closing_pressure", "1", "-recruitment_opening_rate", "4", "-recruitment_start", "0.2"])
