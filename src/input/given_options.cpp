@@ -1,5 +1,4 @@
-/// @file
-/// Options that were given, held against those that are declared: unknown, misspelt, idle and unused; the help.
+// Options that were given, held against those that are declared: unknown, misspelt, idle and unused; the help.
 #include "pulmo/input/options.hpp"
 
 #include "pulmo/base/words.hpp"

@@ -40,9 +40,9 @@ def programme(dice, volume):
     return "\n".join(lines)
 
 
-def scene(dice):
-    """Options and ranks of a random scene, and the text of its programme."""
-    law = dice.choice(pulmo.tissue_laws())
+def scene(dice, laws):
+    """Options and ranks of a random scene with one of the laws, and the text of its programme."""
+    law = dice.choice(laws)
     options = pulmo.PAPER + ["-tissue", law]
     for name, value in TISSUE.get(law, {}).items():
         if dice.random() < 0.3:
@@ -100,14 +100,16 @@ def scene(dice):
 
 @case("Random admissible scenes (seeded)",
       "no crash, hang, NaN, trace or silence; what stops says where tissue folds or that a limit point is reached; at least 55 % finish (a guard "
-      "against regressions)", "185 of 200 seeds")
+      "against regressions)", "185 of 200 seeds; the law concha")
 def fuzz(lab):
     """Laws, parameters, meshes, springs, permeabilities, manoeuvres, steps, solvers and ranks drawn together: combinations that
     nobody thought of. Many have no equilibrium: CM1 to CM4 fold at the airway's rim under the paper's traction, CM4 has a limit
     point."""
+    # a scene of concha that fails takes a minute: its cell is solved at every point
+    laws = [law for law in pulmo.tissue_laws() if not (lab.small and law == "concha")]
     count, ends, faults, unexplained = (15 if lab.small else 200), dict.fromkeys(("finished", "limit", "fold"), 0), [], []
     for seed in range(count):
-        options, ranks, text = scene(random.Random(seed))
+        options, ranks, text = scene(random.Random(seed), laws)
         try:
             run = lab.run(options, ranks=ranks, timeout=120, sound=False)
             fault = lab.fault(run)
