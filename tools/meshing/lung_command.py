@@ -7,7 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from . import mask_command
 from .geometry import tet_volumes
+from .labels import EXAMPLE, PARTS
 from .lungs import SIDES, Options, make_lungs
 from .mesh import MeshError
 from .msh import write_mesh
@@ -39,6 +41,11 @@ def positive(text):
     return value
 
 
+def millilitres(text):
+    """A volume of the command line, with or without its unit."""
+    return positive(text.removesuffix("ml").strip())
+
+
 def count(text):
     """A positive whole number of the command line."""
     value = int(text)
@@ -50,26 +57,37 @@ def count(text):
 def parse(arguments):
     """The command line's options."""
     parser = Parser(prog="lung_mesh", description=(
-        "Make a tetrahedral mesh of parametric human lungs (axes RAS, mm) with the surfaces airway and pleura "
-        "and the volumes right_lung and left_lung."), epilog=(
+        "Make a tetrahedral mesh of parametric human lungs, or of those of a segmented CT (axes RAS, mm), with the surfaces airway "
+        "and pleura and the volumes right_lung and left_lung, or the lobes."), epilog=(
         "Sizes and volumes are those of the mesh at rest. The default sizes are for the default volumes and "
         "follow the size of the lung. The exit code is 0 only if a mesh that passed its checks was written."))
-    parser.add_argument("--side", choices=SIDES, default="both", help="which lung (default: both)")
-    parser.add_argument("--volume", type=positive, metavar="ML",
-                        help="volume of the whole mesh, ml (default: both 2600, right 1404, left 1196)")
+    ct = parser.add_argument_group("from a segmented CT")
+    ct.add_argument("--mask", metavar="LABELS.nii.gz", help=(
+        "label image, or a folder with one image for each lung or lobe, named after it; the lobes become volumes of the mesh"))
+    ct.add_argument("--labels", metavar="PART=NUMBER,...", help=(
+        f"what the labels are, as in {EXAMPLE[9:]}; parts are {', '.join(PARTS)} (default: by the names that come with the file, "
+        "else as in TotalSegmentator or lungmask, which is told)"))
+    ct.add_argument("--surface", action="append", metavar="PART=FILE", help=(
+        "a closed surface (STL, OBJ, PLY, VTP) of a lung, a lobe or the airway in place of --mask, as in --surface right=R.stl "
+        "--surface left=L.stl"))
+    ct.add_argument("--rim-size", type=positive, metavar="MM", help="element size at the lungs' sharp borders (default: 0.55 of the size)")
+    parser.add_argument("--side", choices=SIDES, help="which lung (default: both)")
+    parser.add_argument("--volume", type=millilitres, metavar="ML", help=(
+        "volume of the whole mesh, ml (default: both 2600, right 1404, left 1196; with --mask the scan's, else scaled in all directions)"))
     size = parser.add_mutually_exclusive_group()
     size.add_argument("--size", type=positive, metavar="MM",
-                      help=f"element size away from the airway and the sharp borders, mm (default: {DEFAULT_SIZE:g})")
+                      help="element size away from the airway and the sharp borders, mm "
+                      f"(default: {DEFAULT_SIZE:g}; with --mask {mask_command.SIZE:g})")
     size.add_argument("--cells", type=count, metavar="N",
                       help="aim at N tetrahedra (within 10 %%) instead of a size")
     parser.add_argument("--size-field", metavar="FILE.xdmf", help=(
         "let the sizes follow the error indicators in the fields.xdmf of a run (-output_fields_error_indicator) on a "
         "mesh of the same lungs; as many tetrahedra as there unless --cells is given"))
-    parser.add_argument("--airway", choices=list(AIRWAY_SIZE), default="main",
+    parser.add_argument("--airway", choices=list(AIRWAY_SIZE),
                         help="a hilum patch, a carved main bronchus, or carved lobar bronchi too (default: main)")
     parser.add_argument("--airway-size", type=positive, metavar="MM", help=(
         "element size at the airway, mm (default: " + ", ".join(f"{a} {h:g}" for a, h in AIRWAY_SIZE.items()) + ")"))
-    parser.add_argument("--bronchus-radius", type=positive, metavar="MM", default=BRONCHUS_RADIUS, help=(
+    parser.add_argument("--bronchus-radius", type=positive, metavar="MM", help=(
         "radius of the carved main bronchi, mm in a pair of "
         f"{TEMPLATE_VOLUME:g} ml (default: {BRONCHUS_RADIUS:g}; sets the airway's area)"))
     parser.add_argument("--output", metavar="FILE.msh", default="lung.msh", help="mesh to write (default: lung.msh)")
@@ -79,6 +97,14 @@ def parse(arguments):
     kind.add_argument("--binary", action="store_true", help="write binary")
     parser.add_argument("--picture", metavar="FILE.png", help="draw the mesh too")
     return parser.parse_args(arguments)
+
+
+def check_files(given):
+    """Refuses files that cannot be written, before any work."""
+    for option, path, ending in (("--output", given.output, ".msh"), ("--picture", given.picture, ".png")):
+        folder = os.path.dirname(path or "") or "."
+        if path and not (path.endswith(ending) and os.path.isdir(folder) and os.access(folder, os.W_OK)):
+            raise MeshError(f"{option} {path} must be a {ending} file in a folder that can be written to.")
 
 
 def check_request(given, volume, stretch):
@@ -104,16 +130,13 @@ def filled_in(given):
     """The Options of a parsed command line, with the defaults that depend on the volume."""
     if given.size_field and (given.size or given.airway_size):
         raise MeshError("--size and --airway-size have no meaning with --size-field; give --cells.")
-    volume = given.volume or DEFAULT_VOLUME[given.side]
-    stretch = (volume / DEFAULT_VOLUME[given.side]) ** (1 / 3)
+    side, carved = given.side or "both", given.airway or "main"
+    volume = given.volume or DEFAULT_VOLUME[side]
+    stretch = (volume / DEFAULT_VOLUME[side]) ** (1 / 3)
     check_request(given, volume, stretch)
     size = given.size or DEFAULT_SIZE * stretch
-    airway_size = given.airway_size or min(AIRWAY_SIZE[given.airway] * stretch, size)
-    for option, path, ending in (("--output", given.output, ".msh"), ("--picture", given.picture, ".png")):
-        folder = os.path.dirname(path or "") or "."
-        if path and not (path.endswith(ending) and os.path.isdir(folder) and os.access(folder, os.W_OK)):
-            raise MeshError(f"{option} {path} must be a {ending} file in a folder that can be written to.")
-    return Options(given.side, volume, size, given.airway, airway_size, given.bronchus_radius)
+    airway_size = given.airway_size or min(AIRWAY_SIZE[carved] * stretch, size)
+    return Options(side, volume, size, carved, airway_size, given.bronchus_radius or BRONCHUS_RADIUS)
 
 
 def with_cells(cells, make):
@@ -158,13 +181,26 @@ def mesh_of(given, options):
     return make_lungs(options)
 
 
+def made(given):
+    """Makes the mesh and prints its report; returns the Mesh and the checks that it fails."""
+    if given.mask or given.surface:
+        mask_command.check(given)
+        mesh, source = mask_command.make(given, with_cells)
+        failures = print_report(mesh, measures(mesh)) + mask_command.compare(mesh, source)
+        mask_command.print_times(source)
+        return mesh, failures
+    if given.labels or given.rim_size:
+        raise MeshError(f"{'--labels' if given.labels else '--rim-size'} has no meaning without --mask.")
+    mesh = mesh_of(given, filled_in(given))
+    return mesh, print_report(mesh, measures(mesh))
+
+
 def main(arguments):
     """Run the command line; returns the exit code."""
     given = parse(arguments)
     try:
-        options = filled_in(given)
-        mesh = mesh_of(given, options)
-        failures = print_report(mesh, measures(mesh))
+        check_files(given)
+        mesh, failures = made(given)
         if failures:
             raise MeshError("; ".join(failures) + ", so no mesh was written.")
         write_mesh(mesh, given.output, float(given.format), given.binary)

@@ -4,14 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .geometry import boundary_facets, enclosed_volume, facet_areas, tet_volumes
+from .geometry import boundary_facets, enclosed_volume, tet_volumes
 from .iso_surface import iso_surface
 from .mesh import MeshError, Mesh, merged
-from .quality import MIN_DIHEDRAL, MIN_SICN, dihedral_angles, sicn
 from .shape import bronchi_distance, lung_shape
-from .sizes import follow, limit_near, take_smallest
-from .surfaces import SURFACES, VOLUMES, largest_patch
-from .tetrahedra import mesh_inside
+from .sizes import follow, limit_near
+from .surfaces import SURFACES, VOLUMES, largest_patch, nearest_patch
+from .tetrahedra import good_tetrahedra
 
 SIDES = {"right": ["right"], "left": ["left"], "both": ["right", "left"]}
 RIM_SIZE = 0.55         # element size at sharp borders as a share of the element size elsewhere
@@ -58,7 +57,7 @@ def check_sizes(options, scale):
 
 
 def mesh_lung(side, shape, surface, scale, options):
-    """The Mesh of one lung; a slightly other size is tried where gmsh gives no or bad cells.
+    """The Mesh of one lung.
 
     side: "right" or "left". surface: points (template mm) and triangles. scale: mm per template mm.
     """
@@ -85,17 +84,8 @@ def mesh_lung(side, shape, surface, scale, options):
                 limit_near(centres * scale, largest, max(sizes.max(), largest), reach * scale)]
 
     sizes = wanted_sizes if options.wanted else default_sizes
-    for factor in (1, 0.97, 1.03, 0.94):
-        try:
-            nodes, tets = mesh_inside(points * scale, triangles, lambda: take_smallest(sizes(factor)))
-        except Exception as error:  # gmsh raises bare Exceptions
-            problem = f"gmsh could not mesh the {side} lung at this size ({error})"
-            continue
-        worst, angle = sicn(nodes, tets).min(), dihedral_angles(nodes, tets).min()
-        if worst > MIN_SICN and angle > MIN_DIHEDRAL:
-            return named_lung(side, shape, nodes, tets, scale)
-        problem = f"the {side} lung's worst cell is too flat (SICN {worst:.2f}, dihedral angle {angle:.1f} degrees)"
-    raise MeshError(problem + "; try another --size or --airway-size.")
+    nodes, tets = good_tetrahedra(side, points * scale, triangles, sizes)
+    return named_lung(side, shape, nodes, tets, scale)
 
 
 def named_lung(side, shape, nodes, tets, scale):
@@ -104,14 +94,9 @@ def named_lung(side, shape, nodes, tets, scale):
     centres = nodes[facets].mean(axis=1) / scale
     if shape.capsules:
         inside = bronchi_distance(centres, shape.capsules) < 2
-        airway = inside & (shape.body_at(centres) > 1.5)
+        airway = largest_patch(facets, inside & (shape.body_at(centres) > 1.5))
     else:
-        distance = np.linalg.norm(centres - shape.hilum, axis=1)
-        nearest = np.argsort(distance, kind="stable")
-        area = np.cumsum(facet_areas(nodes, facets[nearest])) / scale**2
-        airway = np.zeros(len(facets), dtype=bool)
-        airway[nearest[area <= HILUM_AREA * 100]] = True
-    airway = largest_patch(facets, airway)
+        airway = nearest_patch(nodes / scale, facets, shape.hilum, HILUM_AREA * 100)
     if side == "left":
         nodes, tets, facets = nodes * (-1, 1, 1), tets[:, [1, 0, 2, 3]], facets[:, ::-1]
     names = {(2, tag): name for name, tag in SURFACES.items()} | {(3, VOLUMES[side]): f"{side}_lung"}

@@ -1,9 +1,12 @@
 """Numbers about a mesh, and whether it passes."""
+from dataclasses import dataclass
+
 import numpy as np
 
-from .geometry import facet_areas, tet_volumes, triangle_edges
+from .geometry import FACES, facet_areas, tet_volumes, triangle_edges
+from .lobes import pieces
 from .quality import MIN_DIHEDRAL, MIN_SICN, dihedral_angles, sicn
-from .surfaces import SURFACES, patches
+from .surfaces import patches
 
 
 def measures(mesh):
@@ -24,21 +27,66 @@ def measures(mesh):
     }
 
 
-def topology(mesh, volume_tag):
-    """Topology of one lung of a Mesh: whether its surface is closed, its genus and its airway patches."""
-    inside = np.zeros(len(mesh.points), dtype=bool)
-    inside[mesh.tets[mesh.regions == volume_tag]] = True
-    mine = inside[mesh.facets].all(axis=1)
-    facets = mesh.facets[mine]
+@dataclass
+class Body:
+    """Cells of a Mesh that hang together: name by their volumes, cells and facets (boolean), volume (ml), areas (cm2), topology."""
+
+    name: str
+    cells: np.ndarray
+    facets: np.ndarray
+    volume: float
+    areas: dict
+    closed: bool
+    genus: float
+    pieces: int
+    airway_patches: int
+
+
+def bodies(mesh):
+    """The Bodies of a Mesh, the one with the lowest volume tag first."""
+    piece = pieces(mesh.tets)
+    owner = piece[cells_of(mesh.tets, mesh.facets)]
+    first = sorted(range(piece.max() + 1), key=lambda k: (mesh.regions[piece == k].min(), k))
+    return [body(mesh, piece == k, owner == k) for k in first]
+
+
+def cells_of(tets, facets):
+    """The tetrahedron that each boundary triangle belongs to."""
+    faces = np.sort(tets[:, FACES].reshape(-1, 3), axis=1)
+    both, number = np.unique(np.concatenate([faces, np.sort(facets, axis=1)]), axis=0, return_inverse=True)
+    cell = np.full(len(both), -1)
+    cell[number[:len(faces)]] = np.arange(len(faces)) // 4
+    return cell[number[len(faces):]]
+
+
+def body(mesh, cells, mine):
+    """The Body of some cells and their facets (boolean)."""
+    facets, tags = mesh.facets[mine], mesh.surfaces[mine]
+    areas = facet_areas(mesh.points, facets) / 100
     edges, count = np.unique(triangle_edges(facets), axis=0, return_counts=True)
-    pieces, _ = patches(facets)
-    airway = facets[mesh.surfaces[mine] == SURFACES["airway"]]
-    return {
-        "closed": bool(np.all(count == 2)),
-        "genus": pieces - (len(np.unique(facets)) - len(edges) + len(facets)) / 2,
-        "pieces": pieces,
-        "airway_patches": patches(airway)[0] if len(airway) else 0,
-    }
+    patch_count, _ = patches(facets)
+    by_name = {name: tags == tag for (dimension, tag), name in mesh.names.items() if dimension == 2}
+    airway = facets[by_name.get("airway", np.zeros(len(facets), dtype=bool))]
+    return Body(
+        body_name(mesh, cells), cells, mine, tet_volumes(mesh.points, mesh.tets[cells]).sum() / 1e3,
+        {name: areas[chosen].sum() for name, chosen in by_name.items()}, bool(np.all(count == 2)),
+        patch_count - (len(np.unique(facets)) - len(edges) + len(facets)) / 2, patch_count,
+        patches(airway)[0] if len(airway) else 0)
+
+
+def body_name(mesh, cells):
+    """A body's name: that of its volume, or of the lung whose lobes it holds."""
+    names = [mesh.names[3, tag] for tag in np.unique(mesh.regions[cells]) if (3, tag) in mesh.names]
+    sides = {name.split("_")[0] for name in names}
+    if len(names) > 1 and len(sides) == 1:
+        return sides.pop() + "_lung"
+    return " + ".join(names) or "no name"
+
+
+def regions(mesh):
+    """{name: ml} of the named volumes."""
+    volumes = tet_volumes(mesh.points, mesh.tets) / 1e3
+    return {name: volumes[mesh.regions == tag].sum() for (dimension, tag), name in mesh.names.items() if dimension == 3}
 
 
 def print_report(mesh, numbers):
@@ -47,7 +95,7 @@ def print_report(mesh, numbers):
     print(f"tetrahedra             {numbers['tets']}")
     print(f"nodes                  {numbers['nodes']}")
     print(f"volume                 {numbers['volume']:.3f} ml")
-    print(f"pleura, airway area    {areas['pleura']:.1f}, {areas['airway']:.2f} cm2")
+    print(f"pleura, airway area    {areas.get('pleura', 0):.1f}, {areas.get('airway', 0):.2f} cm2")
     print(f"area / volume^(2/3)    {numbers['shape']:.2f}")
     print(f"min SICN               {numbers['min_sicn']:.3f}")
     print(f"min dihedral angle     {numbers['min_dihedral']:.1f} degrees")
@@ -55,11 +103,9 @@ def print_report(mesh, numbers):
     failures = []
     if numbers["min_sicn"] <= MIN_SICN or numbers["min_dihedral"] <= MIN_DIHEDRAL:
         failures.append("the worst cell is too flat")
-    for (dimension, tag), name in mesh.names.items():
-        if dimension == 3:
-            facts = topology(mesh, tag)
-            print(f"{name:<22} {'closed' if facts['closed'] else 'OPEN'}, genus {facts['genus']:g}, "
-                  f"airway patches {facts['airway_patches']}, {np.sum(mesh.regions == tag)} tets")
-            if facts != {"closed": True, "genus": 0, "pieces": 1, "airway_patches": 1}:
-                failures.append(f"the {name} is not one closed surface of genus 0 with one airway patch")
+    for one in bodies(mesh):
+        print(f"{one.name:<22} {'closed' if one.closed else 'OPEN'}, genus {one.genus:g}, "
+              f"airway patches {one.airway_patches}, {np.sum(one.cells)} tets")
+        if (one.closed, one.genus, one.pieces, one.airway_patches) != (True, 0, 1, 1):
+            failures.append(f"the {one.name} is not one closed surface of genus 0 with one airway patch")
     return failures

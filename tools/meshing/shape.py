@@ -102,12 +102,21 @@ class Shape:
 
     def rim(self, points):
         """Those of the surface points (n, 3) that lie on the sharp borders of the uncarved lung, thinned out."""
-        normal = np.array(np.gradient(ndimage.gaussian_filter(-self.body, 1.0), GRID))
-        normal /= np.maximum(np.linalg.norm(normal, axis=0), 1e-6)
-        bend = sum(np.gradient(normal[i], GRID, axis=i) for i in range(3))
-        sharp = points[(self.sampled(bend, points) > RIM_BEND) & (np.abs(self.body_at(points)) < GRID)]
-        _, first = np.unique(np.round(sharp / (2 * GRID)), axis=0, return_index=True)
-        return sharp[first]
+        bend = bending(self.body, GRID)
+        return thinned(points[(self.sampled(bend, points) > RIM_BEND) & (np.abs(self.body_at(points)) < GRID)], 2 * GRID)
+
+
+def bending(distance, step):
+    """Sum of the principal curvatures of the levels of a distance (positive inside), 1/mm, on a grid of a step (mm)."""
+    normal = np.array(np.gradient(ndimage.gaussian_filter(-distance, 1.0), step))
+    normal /= np.maximum(np.linalg.norm(normal, axis=0), 1e-6)
+    return sum(np.gradient(normal[i], step, axis=i) for i in range(3))
+
+
+def thinned(points, apart):
+    """Some of the points (n, 3), about one in each cube of an edge."""
+    _, first = np.unique(np.round(points / apart), axis=0, return_index=True)
+    return points[first]
 
 
 def lung_shape(side, airway, bronchus_radius):

@@ -2,10 +2,15 @@
 import numpy as np
 from scipy import sparse
 
-from .geometry import triangle_edges
+from .geometry import facet_areas, triangle_edges
 
 SURFACES = {"airway": 1, "pleura": 2}
-VOLUMES = {"right": 3, "left": 4}
+VOLUMES = {"right": 3, "left": 4, "right_upper": 5, "right_middle": 6, "right_lower": 7, "left_upper": 8, "left_lower": 9}
+
+
+def volume_name(part):
+    """Physical name of a lung or lobe, one of VOLUMES."""
+    return part + ("_lobe" if "_" in part else "_lung")
 
 
 def patches(facets):
@@ -23,3 +28,12 @@ def largest_patch(facets, chosen):
     kept = chosen.copy()
     kept[chosen] = patch == np.argmax(np.bincount(patch))
     return kept
+
+
+def nearest_patch(points, facets, place, area):
+    """The triangles (boolean) nearest to a place, up to an area in the square of the points' unit, in one patch."""
+    distance = np.linalg.norm(points[facets].mean(axis=1) - place, axis=1)
+    nearest = np.argsort(distance, kind="stable")
+    chosen = np.zeros(len(facets), dtype=bool)
+    chosen[nearest[np.cumsum(facet_areas(points, facets[nearest])) <= area]] = True
+    return largest_patch(facets, chosen)

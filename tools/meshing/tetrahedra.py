@@ -6,7 +6,28 @@ import numpy as np
 
 from .geometry import boundary_facets, orient, triangle_edges
 from .gmsh_model import gmsh_elements, gmsh_nodes, gmsh_session
-from .quality import sicn, sicn_of_corners
+from .mesh import MeshError
+from .quality import MIN_DIHEDRAL, MIN_SICN, dihedral_angles, sicn, sicn_of_corners
+from .sizes import take_smallest
+
+
+def good_tetrahedra(side, points, triangles, sizes):
+    """Nodes and tetrahedra inside one lung's surface; a slightly other size is tried where gmsh gives no or bad cells.
+
+    side: "right" or "left", for messages. points, triangles: the surface, mm. sizes: gmsh's fields of element sizes from a
+    factor of all sizes.
+    """
+    for factor in (1, 0.97, 1.03, 0.94):
+        try:
+            nodes, tets = mesh_inside(points, triangles, lambda: take_smallest(sizes(factor)))
+        except Exception as error:  # gmsh raises bare Exceptions
+            problem = f"gmsh could not mesh the {side} lung at this size ({error})"
+            continue
+        worst, angle = sicn(nodes, tets).min(), dihedral_angles(nodes, tets).min()
+        if worst > MIN_SICN and angle > MIN_DIHEDRAL:
+            return nodes, tets
+        problem = f"the {side} lung's worst cell is too flat (SICN {worst:.2f}, dihedral angle {angle:.1f} degrees)"
+    raise MeshError(problem + "; try another --size or --airway-size.")
 
 
 def mesh_inside(points, triangles, set_sizes):
