@@ -4,6 +4,7 @@ import filecmp
 import io
 import json
 import os
+import re
 import sys
 import unittest
 
@@ -24,6 +25,7 @@ MIDDLE = {"right": np.array([62.0, -5.0, 20.0]), "left": np.array([-58.0, -5.0, 
 VOLUME = 4 / 3 * np.pi * HALF.prod() / 1e3  # ml of each
 COARSE = ["--size", "22"]
 RIGHT, LEFT, TUBE = 1, 2, 3
+CUTS = np.array([-20.5, 21.5])  # between the right lobes, mm above the middle and between voxels
 FORK = np.array([0.0, -5.0, 60.0])  # of the trachea
 
 
@@ -59,7 +61,7 @@ def lobed(x):
     plain = anatomy(x)
     z = x[..., 2] - MIDDLE["left"][2]
     labels[plain == LEFT] = np.where(oblique(x[plain == LEFT]) > 0, 10, 11)
-    labels[plain == RIGHT] = np.where(z[plain == RIGHT] > 20, 12, np.where(z[plain == RIGHT] > -20, 13, 14))
+    labels[plain == RIGHT] = np.where(z[plain == RIGHT] > CUTS[1], 12, np.where(z[plain == RIGHT] > CUTS[0], 13, 14))
     labels[plain == TUBE] = 16
     labels[x[..., 2] > 125] = 1  # something else
     return labels
@@ -156,6 +158,153 @@ class Masks(unittest.TestCase):
         summary = case.json()
         self.assertAlmostEqual(summary["reference_volume_ml"] / (2 * VOLUME), 1, delta=0.01)
         self.assertGreater(case.signals()["volume_ml"][-1], 0)
+
+    def test_any_orientation_lies_at_the_same_place(self):
+        """LPS voxels, a mirrored matrix with swapped axes, oblique thick slices: right stays right, volumes and middles stay."""
+        a = 0.3
+        oblique_axes = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]]) @ np.diag([-1, -1, 1])
+        swapped = np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]])[:, [1, 0, 2]]  # det -1
+        self.assertLess(np.linalg.det(swapped), 0)
+        for what, words in (("LPS, thick slices", dict(axes=oblique_axes, spacing=(2, 2, 6))),
+                            ("mirrored and swapped", dict(axes=swapped, spacing=(3.5, 3, 3)))):
+            with self.subTest(what):
+                mesh, out = self.meshed(saved(image(**words)), *COARSE)
+                self.check(mesh, within=0.015)
+                self.assertIn("labels as lungmask: right=1, left=2", out)
+                self.assertIn("not used: 3 (", out)
+                self.assertIn("no airway label", out)
+                self.assertEqual("interpolated between slices" in out, "thick" in what)
+
+    def test_lobes_become_volumes(self):
+        """TotalSegmentator's numbers; cells on both sides of a fissure share its nodes, which lie on the plane that cuts the mask."""
+        mesh, out = self.meshed(saved(image(lobed)), "--size", "11")
+        self.assertIn("labels as TotalSegmentator 2: left_upper=10, left_lower=11, right_upper=12, right_middle=13, right_lower=14, airway=16",
+                      out)
+        self.assertIn("not used: 1 (", out)
+        self.assertEqual(sorted(mesh.names.values()), ["airway", "left_lower_lobe", "left_upper_lobe", "pleura", "right_lower_lobe",
+                                                       "right_middle_lobe", "right_upper_lobe"])
+        self.assertIn("right_lung             closed, genus 0, airway patches 1", out)
+        volume = {name: tet_volumes(mesh.points, mesh.tets[mesh.regions == tag]).sum() / 1e3
+                  for (dimension, tag), name in mesh.names.items() if dimension == 3}
+        t = np.abs(CUTS) / HALF[2]
+        lower, upper = VOLUME * (2 / 3 - t + t**3 / 3) * 3 / 4  # of an ellipsoid beyond t half axes
+        expected = {"left_upper_lobe": VOLUME / 2, "left_lower_lobe": VOLUME / 2, "right_upper_lobe": upper, "right_lower_lobe": lower,
+                    "right_middle_lobe": VOLUME - upper - lower}
+        for name, wanted in expected.items():
+            self.assertAlmostEqual(volume[name] / wanted, 1, delta=0.025, msg=name)
+        tags = {name: tag for (_, tag), name in mesh.names.items()}
+        shared = np.intersect1d(*(mesh.tets[mesh.regions == tags[f"left_{lobe}_lobe"]] for lobe in ("upper", "lower")))
+        inner = np.setdiff1d(shared, mesh.facets)
+        self.assertGreater(len(inner), 10)
+        self.assertLess(np.median(np.abs(oblique(mesh.points[inner]))), 1)
+        self.assertLess(np.abs(oblique(mesh.points[inner])).mean(), 2)
+
+    def test_one_label_islands_and_touching_lungs(self):
+        """Both lungs under one label that touch come apart by position; islands are left out with their volume."""
+        def bridged(values):
+            values[values == TUBE] = 0
+            values[values > 0] = 1
+            values[30:48, 21:26, 30:36] = 1  # joins the lungs
+            values[2:6, 2:6, 2:6] = 1  # 1.7 ml apart
+        mesh, out = self.meshed(changed(bridged), *COARSE)
+        self.assertIn("there is only one label: lungs=1", out)
+        self.assertIn("cut where they touch", out)
+        self.assertRegex(out, r"1 island of 1\.\d+ ml left out")
+        self.check(mesh, within=0.03)
+
+    def test_another_volume_is_a_uniform_scaling(self):
+        """--volume scales about the middle and says what that assumes; --cells counts."""
+        mesh, out = self.meshed(saved(image()), "--volume", "1000ml", "--cells", "1500")
+        self.assertAlmostEqual(tet_volumes(mesh.points, mesh.tets).sum() / 1e6, 1, delta=1e-6)
+        self.assertAlmostEqual(len(mesh.tets) / 1500, 1, delta=0.1)
+        self.assertIn("That assumes that the lungs have the same shape", out)
+        told = float(re.search(r"times ([0-9.]+) in every direction", out)[1])
+        self.assertAlmostEqual(told, (1000 / (2 * VOLUME)) ** (1 / 3), delta=0.002)
+
+    def test_names_of_a_folder_and_of_a_table(self):
+        """One file for each organ, named after it; a JSON beside the image; a table in its header; all give the same bytes."""
+        folder = os.path.dirname(pulmo.scratch())
+        for number, name in ((RIGHT, "lung_right"), (LEFT, "lung_left"), (TUBE, "trachea")):
+            nibabel.save(nibabel.Nifti1Image((np.asarray(image().dataobj) == number).astype(np.uint8), image().affine),
+                         os.path.join(folder, name + ".nii.gz"))
+        saved_image = image()
+        beside = saved(image())
+        with open(beside.replace(".nii.gz", ".json"), "w", encoding="utf-8") as file:
+            json.dump({"labels": {"background": 0, "Right lung": RIGHT, "LL": LEFT, "Left Lung": LEFT, "trachea and bronchi": TUBE}}, file)
+        table = "".join(f'<Label Key="{n}"><![CDATA[{name}]]></Label>' for n, name in
+                        ((RIGHT, "lung_right"), (LEFT, "lung_left"), (TUBE, "lung_trachea_bronchia"), (9, "rib_left_3")))
+        saved_image.header.extensions.append(nibabel.nifti1.Nifti1Extension(
+            0, f'<?xml version="1.0" encoding="UTF-8"?> <CaretExtension><LabelTable>{table}</LabelTable></CaretExtension>'.encode()))
+        files = []
+        for path in (folder, beside, saved(saved_image)):
+            mesh, out = self.meshed(path, *COARSE)
+            files.append(self.path)
+            self.check(mesh)
+            self.assertIn("by the names that come with the file", out)
+        self.assertTrue(filecmp.cmp(files[0], files[1], shallow=False) and filecmp.cmp(files[0], files[2], shallow=False))
+
+    def test_what_names_mean(self):
+        for name, part in (("lung_upper_lobe_left", "left_upper"), ("Right Middle Lobe", "right_middle"), ("RLL", "right_lower"),
+                           ("lung_left", "left"), ("left lung", "left"), ("right", "right"), ("lungs", "lungs"), ("trachea", "airway"),
+                           ("lung_trachea_bronchia", "airway"), ("rib_left_3", None), ("lung_vessels", None), ("lung_nodule", None),
+                           ("kidney_left", None), ("occipital_lobe", None), ("L", None), ("left lobe", None), ("upper lobe", None), ("", None)):
+            self.assertEqual(part_of(name), part, name)
+
+    def test_refusals(self):
+        """One sentence each, no file, exit code 1."""
+        def two_pieces(values):
+            values[values == RIGHT] = 0
+            values[50:60, 10:40, 5:25] = RIGHT
+            values[50:60, 10:40, 40:60] = RIGHT
+
+        def tunnel(values):
+            values[30:80, 20:30, 25:38] = 0
+
+        ct = saved(image(lambda x: 40 * x[..., 2], dtype=np.int16), "ct.nii.gz")
+        four = saved(nibabel.Nifti1Image(np.zeros((4, 4, 4, 2), np.uint8), np.eye(4)), "four.nii.gz")
+        none = pulmo.scratch("text.nii.gz")
+        with open(none, "w", encoding="utf-8") as file:
+            file.write("no image")
+        three = changed(lambda v: np.where(v == 0, 0, v + 20).astype(np.uint8))
+        unknown = nibabel.Nifti1Image(np.asarray(image().dataobj), None)
+        unknown.header["pixdim"][1:4] = 3
+        unknown.header.set_qform(None, 0)
+        unknown.header.set_sform(None, 0)
+        plain = saved(image())
+        for words, told in (
+                ([changed(lambda v: v * 0)], "is empty: every voxel is 0"),
+                ([four], "has 4 dimensions (4 x 4 x 4 x 2); it takes one image of three"),
+                ([ct], "so it is a CT or the like and no label image"),
+                ([saved(nibabel.Nifti1Image(np.random.default_rng(1).random((9, 9, 9)), np.eye(4)), "p.nii.gz")], "values with decimals"),
+                ([none], "is no NIfTI file that can be read"),
+                (["none.nii.gz"], "there is no such file"),
+                ([three], "it cannot be told which labels are the lungs; there are 21 ("),
+                ([plain, "--labels", "right=1,left=7"], "--labels left=7: no voxel has label 7; there are 1 ("),
+                ([plain, "--labels", "right=1,liver=2"], "'liver=2' is no PART=NUMBER"),
+                ([plain, "--labels", "right=1,left=1"], "label 1 is named twice"),
+                ([plain, "--labels", "right=2,left=1"], "what is named right lies at x = -58 mm and left at 62 mm"),
+                ([saved(image(spacing=(14, 14, 14)))], "voxels across; it takes"),
+                ([changed(two_pieces), "--labels", "right=1,left=2"], "the right lung is in 2 large pieces"),
+                ([changed(two_pieces), "--labels", "lungs=1+2"], "three large pieces"),
+                ([changed(tunnel), "--labels", "right=1"], "has holes through it"),
+                ([changed(lambda v: np.where(v == LEFT, 0, v).astype(np.uint8)), "--labels", "lungs=1"], "does not come apart in two"),
+                ([plain, "--airway", "main"], "--airway has no meaning with --mask"),
+                ([plain, "--size", "400"], "--size 400 mm is no size that lungs of"),
+                ([plain, "--rim-size", "100"], "--rim-size 100 mm is outside")):
+            with self.subTest(told):
+                mesh = pulmo.scratch("none.msh")
+                code, out, err = called("--mask", *words, "--output", mesh)
+                self.assertEqual(code, 1, out + err)
+                self.assertIn(told, err)
+                self.assertEqual(len(err.splitlines()), 1, err)
+                self.assertTrue(err.startswith("lung_mesh: "), err)
+                self.assertFalse(os.path.exists(mesh))
+        for words in (["--labels", "right=1"], ["--rim-size", "5"]):
+            self.assertIn("has no meaning without --mask", called(*words, "--output", mesh)[2])
+        # an unknown orientation is told, and its default contradicts labels that are the other way round
+        out = called("--mask", saved(unknown), "--labels", "right=1,left=2", "--output", mesh)
+        self.assertIn("says nothing about its orientation", out[1])
+        self.assertIn("the labels are swapped or the header's orientation is wrong", out[2])
 
 
 if __name__ == "__main__":

@@ -59,7 +59,7 @@ def stem(path):
     return re.sub(r"\.nii(\.gz)?$", "", os.path.basename(path))
 
 
-def load(path):
+def load(path, say):
     """The nibabel image of a NIfTI file of three dimensions, its axes turned to right, front, up."""
     import nibabel
 
@@ -77,6 +77,9 @@ def load(path):
         elif len(shape) != 3:
             raise MeshError(f"--mask {path} has {len(shape)} dimensions ({' x '.join(map(str, shape))}); it takes one image of "
                             "three, so save one time or one channel.")
+        if image.header["qform_code"] == 0 and image.header["sform_code"] == 0:
+            say(f"{path} says nothing about its orientation (qform_code and sform_code are 0): left and right are taken as NIfTI's "
+                "default (voxels stored from right to left); check them.")
         return nibabel.as_closest_canonical(image)
     except MeshError:
         raise
@@ -108,9 +111,6 @@ def place(image, path, say):
     factor = UNITS[unit]
     if factor != 1:
         say(f"the file's unit of length is {unit}: turned into mm.")
-    if image.header["qform_code"] == 0 and image.header["sform_code"] == 0:
-        say(f"{path} says nothing about its orientation (qform_code and sform_code are 0): left and right are taken as NIfTI's "
-            "default (voxels stored from right to left); check them.")
     axes = image.affine[:3, :3] * factor
     spacing = np.linalg.norm(axes, axis=0)
     if not (np.isfinite(image.affine).all() and (spacing > 0).all() and abs(np.linalg.det(axes / spacing)) > 0.1):
@@ -132,7 +132,7 @@ def unsheared(values, spacing, rotation, origin):
 
 def read_file(path, say):
     """The LabelImage of one NIfTI file."""
-    image = load(path)
+    image = load(path, say)
     values = whole_numbers(image, path)
     spacing, rotation, origin = place(image, path, say)
     if np.abs(rotation.T @ rotation - np.eye(3)).max() > SKEW:
@@ -156,16 +156,13 @@ def read_folder(folder, say):
     for number, path in enumerate(files, 1):
         one = read_file(path, say if whole is None else lambda note: None)
         if whole is None:
-            whole = one
-            whole.values = np.zeros(one.values.shape, np.uint8)
-            whole.names = {}
-            values = one.values
+            whole = LabelImage(np.zeros(one.values.shape, np.uint8), one.spacing, one.rotation, one.origin, {})
         elif one.values.shape != whole.values.shape or not np.allclose(
                 [*one.spacing, *one.origin, *one.rotation.ravel()], [*whole.spacing, *whole.origin, *whole.rotation.ravel()], atol=1e-3):
             raise MeshError(f"--mask {folder}: {os.path.basename(path)} is not on the grid of {os.path.basename(files[0])}.")
-        else:
-            values = one.values
-        whole.values[(values > 0) & (whole.values == 0)] = number
+        if not one.values.any():
+            say(f"{os.path.basename(path)} is empty.")
+        whole.values[(one.values > 0) & (whole.values == 0)] = number
         whole.names[number] = stem(path)
     return whole
 

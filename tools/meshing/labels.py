@@ -78,13 +78,15 @@ def from_option(text, present, names):
     return parts
 
 
-def from_names(names, present):
-    """{part: numbers} of {number: name}; numbers that no voxel has are left out."""
+def from_names(names, present, say):
+    """{part: numbers} of {number: name}; numbers that no voxel has are left out, which is told."""
     parts = {}
     for number, name in names.items():
         part = part_of(name)
         if part and number in present:
             parts.setdefault(part, []).append(number)
+        elif part:
+            say(f"no voxel has the label of {name} ({number}).")
     return parts
 
 
@@ -116,7 +118,7 @@ def find_parts(present, names, asked, say):
     if asked:
         parts = from_option(asked, present, names)
     else:
-        parts, known = from_names(names, present), "the names that come with the file"
+        parts, known = from_names(names, present, say), "the names that come with the file"
         if not any(part != "airway" for part in parts):
             parts, known = from_numbers(present)
         if not parts and len(present) == 1:
