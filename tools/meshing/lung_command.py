@@ -8,12 +8,14 @@ from dataclasses import replace
 import numpy as np
 
 from . import mask_command
+from .check_command import check
 from .geometry import tet_volumes
 from .labels import EXAMPLE, PARTS
 from .lungs import SIDES, Options, make_lungs
 from .mesh import MeshError
 from .msh import write_mesh
 from .picture import picture
+from .quality_page import write_page
 from .report import measures, print_report
 from .shape import BRONCHUS_RADIUS, TEMPLATE_VOLUME
 from .size_field import read_size_field
@@ -96,12 +98,16 @@ def parse(arguments):
     kind.add_argument("--ascii", action="store_true", help="write text (the default, and the shorter file)")
     kind.add_argument("--binary", action="store_true", help="write binary")
     parser.add_argument("--picture", metavar="FILE.png", help="draw the mesh too")
+    parser.add_argument("--report", metavar="FILE.html", help="write a page about the mesh: volumes, areas, quality, picture")
+    parser.add_argument("--check", metavar="FILE", help=(
+        "make nothing, but tell what another mesh (MSH, or what meshio reads) holds and whether it would pass; --picture and --report as above"))
     return parser.parse_args(arguments)
 
 
 def check_files(given):
     """Refuses files that cannot be written, before any work."""
-    for option, path, ending in (("--output", given.output, ".msh"), ("--picture", given.picture, ".png")):
+    for option, path, ending in (("--output", given.output, ".msh"), ("--picture", given.picture, ".png"),
+                               ("--report", given.report, ".html")):
         folder = os.path.dirname(path or "") or "."
         if path and not (path.endswith(ending) and os.path.isdir(folder) and os.access(folder, os.W_OK)):
             raise MeshError(f"{option} {path} must be a {ending} file in a folder that can be written to.")
@@ -182,17 +188,25 @@ def mesh_of(given, options):
 
 
 def made(given):
-    """Makes the mesh and prints its report; returns the Mesh and the checks that it fails."""
+    """Makes the mesh and prints its report; returns the Mesh, the checks that it fails, the notes, and volumes it should have."""
     if given.mask or given.surface:
         mask_command.check(given)
         mesh, source = mask_command.make(given, with_cells)
         failures = print_report(mesh, measures(mesh)) + mask_command.compare(mesh, source)
         mask_command.print_times(source)
-        return mesh, failures
+        return mesh, failures, source.notes, source.mask
     if given.labels or given.rim_size:
         raise MeshError(f"{'--labels' if given.labels else '--rim-size'} has no meaning without --mask.")
     mesh = mesh_of(given, filled_in(given))
-    return mesh, print_report(mesh, measures(mesh))
+    return mesh, print_report(mesh, measures(mesh)), [], None
+
+
+def show(given, mesh, title, failures, notes, mask=None):
+    """Writes the picture and the page that were asked for."""
+    if given.picture:
+        picture(mesh, given.picture)
+    if given.report:
+        write_page(given.report, mesh, title, failures, notes, mask)
 
 
 def main(arguments):
@@ -200,12 +214,18 @@ def main(arguments):
     given = parse(arguments)
     try:
         check_files(given)
-        mesh, failures = made(given)
+        if given.check:
+            mesh, failures, notes = check(given.check)
+            show(given, mesh, os.path.basename(given.check), failures, notes)
+            if failures:
+                raise MeshError("; ".join(failures) + ".")
+            print("passes all checks")
+            return 0
+        mesh, failures, notes, mask = made(given)
+        show(given, mesh, os.path.basename(given.output), failures, notes, mask)
         if failures:
             raise MeshError("; ".join(failures) + ", so no mesh was written.")
         write_mesh(mesh, given.output, float(given.format), given.binary)
-        if given.picture:
-            picture(mesh, given.picture)
     except MeshError as error:
         print(f"lung_mesh: {error}", file=sys.stderr)
         return 1

@@ -8,8 +8,9 @@ from .label_image import LabelImage
 from .labels import LOBES, side_of
 from .mesh import MeshError
 
-GRID = 2.25             # mm between points for a lung of GRID_VOLUME; the surface has about 40,000 triangles at any size
+GRID = 2.25             # mm between points for a lung of GRID_VOLUME; its surface has about 40,000 triangles
 GRID_VOLUME = 1500      # ml
+STEPS = (2, 6)          # of the grid along a cell's edge, least and most
 FEWEST_ACROSS = 12      # voxels across a lung (cube root of its volume) below which it is refused
 FEW_ACROSS = 30         # and below which this is told
 ISLAND = 0.1            # share of a lung's volume above which a second piece is no island
@@ -54,7 +55,7 @@ class Scan:
 
 
 def read_scan(image, parts, size, say):
-    """The Scan of a LabelImage; parts: {part: numbers}; size: edge of the mesh's cells, mm in the image, or None."""
+    """The Scan of a LabelImage; parts: {part: numbers}; size: edge of the mesh's cells, mm in the image."""
     wanted = np.isin(np.arange(image.values.max() + 1), [n for numbers in parts.values() for n in numbers])
     lungs_only = np.isin(np.arange(image.values.max() + 1),
                          [n for part, numbers in parts.items() if part != "airway" for n in numbers])
@@ -68,8 +69,7 @@ def read_scan(image, parts, size, say):
     pair = any(side_of(part) == "right" for part in parts) and any(side_of(part) == "left" for part in parts) or "lungs" in parts
     check_resolution(volume / (2 if pair else 1), image.spacing, say)
     grid = GRID * (volume / (2 if pair else 1) / GRID_VOLUME) ** (1 / 3)
-    if size:
-        grid = min(grid, size / 2)
+    grid = np.clip(grid, size / STEPS[1], size / STEPS[0])
     factors = np.maximum(np.floor(grid / image.spacing + 0.01), 1).astype(int)
     shares, start = averaged(image, parts, box, factors, wanted)
     step = image.spacing * factors

@@ -1,21 +1,24 @@
 """A picture of a lung mesh."""
 import numpy as np
 
-from .surfaces import SURFACES
-
 
 def picture(mesh, path):
-    """Save a picture of a lung Mesh: from the front with the airway seen through, and obliquely from below."""
+    """Save a picture of a lung Mesh."""
+    figure(mesh).savefig(path)
+
+
+def figure(mesh):
+    """A lung Mesh from the front with the airway seen through, and obliquely from below."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10, 5), dpi=84)
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(1, 2)
+    drawn = Figure(figsize=(10, 5), dpi=84)
+    FigureCanvasAgg(drawn)
+    axes = drawn.subplots(1, 2)
     draw(axes[0], mesh, (0, 1, 0.08), 0.5)
     draw(axes[1], mesh, (-0.75, 0.6, -0.25), 1.0)
-    figure.subplots_adjust(0.01, 0.01, 0.99, 0.99, 0.02)
-    figure.savefig(path)
+    drawn.subplots_adjust(0.01, 0.01, 0.99, 0.99, 0.02)
+    return drawn
 
 
 def draw(axes, mesh, towards_eye, opacity):
@@ -33,7 +36,8 @@ def draw(axes, mesh, towards_eye, opacity):
     corners = mesh.points[mesh.facets]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    airway = mesh.surfaces == SURFACES["airway"]
+    tags = [tag for (dimension, tag), name in mesh.names.items() if dimension == 2 and name == "airway"]
+    airway = np.isin(mesh.surfaces, tags)
     colours = np.where(airway[:, None], (0.16, 0.45, 0.75), (0.93, 0.62, 0.58))
     facing = normals @ eye > 0
     shade = 0.55 + 0.45 * np.clip(np.abs(normals @ light) / np.linalg.norm(light), 0, 1)
