@@ -8,6 +8,7 @@ import re
 import sys
 import unittest
 
+import meshio
 import nibabel
 import numpy as np
 
@@ -19,6 +20,7 @@ from meshing.geometry import boundary_facets, facet_areas, tet_volumes  # noqa: 
 from meshing.labels import part_of  # noqa: E402
 from meshing.msh import read_mesh  # noqa: E402
 from meshing.quality import dihedral_angles, sicn  # noqa: E402
+from meshing.sphere import mirrored as octants, octant_directions  # noqa: E402
 
 HALF = np.array([42.0, 55.0, 85.0])  # axes of both lungs
 MIDDLE = {"right": np.array([62.0, -5.0, 20.0]), "left": np.array([-58.0, -5.0, 20.0])}
@@ -85,6 +87,14 @@ def image(labels=anatomy, spacing=(3, 3, 3), axes=np.eye(3), low=(-115, -75, -80
     made = nibabel.Nifti1Image(values.astype(dtype), affine)
     made.header.set_xyzt_units("mm")
     return made
+
+
+def ellipsoid(middle, fineness=24):
+    """Points and triangles of a lung's surface, seen from outside."""
+    points, triangles = octants(*octant_directions(fineness))
+    a, b, c = np.moveaxis(points[triangles], 1, 0)
+    inwards = np.sum(a * np.cross(b, c), axis=1) < 0
+    return points * HALF + middle, np.where(inwards[:, None], triangles[:, ::-1], triangles)
 
 
 def saved(made, name="labels.nii.gz"):
@@ -242,6 +252,81 @@ class Masks(unittest.TestCase):
             self.check(mesh)
             self.assertIn("by the names that come with the file", out)
         self.assertTrue(filecmp.cmp(files[0], files[1], shallow=False) and filecmp.cmp(files[0], files[2], shallow=False))
+
+    def test_closed_surfaces(self):
+        """An STL file in LPS as 3D Slicer writes it, and others, give the lungs that they enclose; bad ones are refused."""
+        right, left = ellipsoid(MIDDLE["right"]), ellipsoid(MIDDLE["left"])
+        enclosed = tet_volumes(np.vstack([right[0], MIDDLE["right"]]),
+                               np.hstack([right[1], np.full((len(right[1]), 1), len(right[0]))])).sum() / -1e3
+        stl, ply, obj = pulmo.scratch("right.stl"), pulmo.scratch("left.ply"), pulmo.scratch("bad.obj")
+        meshio.write(stl, meshio.Mesh(right[0] * (-1, -1, 1), [("triangle", right[1])]), "stl", binary=True)
+        with open(stl, "r+b") as file:
+            file.write(b"3D Slicer output. SPACE=LPS")
+        meshio.write(ply, meshio.Mesh(left[0], [("triangle", left[1][:, ::-1])]))  # seen from inside
+        mesh, out = self.meshed(f"right={stl}", "--surface", f"left={ply}", *COARSE, route="--surface")
+        self.assertIn("its axes are LPS", out)
+        self.check(mesh, volume=abs(enclosed), within=0.005)
+
+        both = np.vstack([right[0], right[0] + (20, 0, 0)]), np.vstack([right[1], right[1] + len(right[0])])
+        for points, triangles, told in ((*right, "--surface right=none.stl: there is no such file"),
+                                        (right[0], right[1][1:], "is open: 3 edges have a triangle on one side only"),
+                                        (right[0], np.vstack([right[1], [[0, 1, 2]]]), "edges"),
+                                        (*both, "cuts through itself near (")):
+            with self.subTest(told):
+                meshio.write(obj, meshio.Mesh(points, [("triangle", triangles)]))
+                path = "none.stl" if "none" in told else obj
+                code, out, err = called("--surface", f"right={path}", "--output", pulmo.scratch("none.msh"))
+                self.assertEqual(code, 1, out + err)
+                self.assertIn(told, err)
+                self.assertEqual(len(err.splitlines()), 1, err)
+
+    def test_other_meshes_are_checked(self):
+        """--check: what a file holds and what is wrong with it, on good, left-handed, unnamed, doubled and two-body meshes."""
+        good = pulmo.mesh("lung_pair.msh")
+        page = pulmo.scratch("page.html")
+        code, out, err = called("--check", good, "--report", page)
+        self.assertEqual(code, 0, err)
+        self.assertIn("passes all checks", out)
+        self.assertNotIn("note:", out)
+        with open(page, encoding="utf-8") as file:
+            text = file.read()
+        pair = read_mesh(good)
+        for (dimension, tag), name in pair.names.items():
+            if dimension == 3:
+                volume = tet_volumes(pair.points, pair.tets[pair.regions == tag]).sum() / 1e3
+                self.assertIn(f'<th scope="row">{name}</th><td>{volume:.1f}</td>', text)
+        self.assertNotIn("http", text)
+        read = meshio.read(pulmo.mesh("cube_msh22_ascii.msh"))
+        tets, triangles = read.cells_dict["tetra"], read.cells_dict["triangle"]
+
+        def checked(points, tets, triangles, tags, names):
+            path = pulmo.scratch("other.msh")
+            data = [tags, np.full(len(tets), 9)]
+            meshio.write(path, meshio.Mesh(points, [("triangle", triangles), ("tetra", tets)], field_data=names, cell_data={
+                "gmsh:physical": data, "gmsh:geometrical": data}), "gmsh22", binary=False)
+            return called("--check", path)
+
+        names = {"inlet": np.array([1, 2]), "pleura": np.array([2, 2]), "tissue": np.array([9, 3])}
+        points = read.points * 130
+        tags = np.where((points[triangles] > 129).all(axis=1)[:, 0], 1, 2)
+        code, out, err = checked(points, tets[:, [1, 0, 2, 3]], triangles, tags, names)
+        self.assertEqual(code, 1)
+        self.assertIn("24 of 24 tetrahedra are left-handed", out)
+        self.assertIn("no surface is called airway; there are inlet, pleura", out)
+        self.assertIn("tissue is not one closed surface of genus 0 with one airway patch", err)
+        self.assertIn("volume                 2197.000 ml", out)
+        code, out, err = checked(points / 1000, tets, triangles[tags == 2], tags[tags == 2], names)
+        self.assertIn("no adult's lung; if the file is in m, give pulmo -mesh_scale 1000", out)
+        self.assertIn("cm2 of the surface have no name", out)
+        # a second cube on the first, its nodes not joined
+        double = np.vstack([points, points + (130, 0, 0)])
+        code, out, err = checked(double, np.vstack([tets, tets + len(points)]), np.vstack([triangles, triangles + len(points)]),
+                                 np.concatenate([tags, tags]), names)
+        self.assertIn("are not joined (a tear)", out)
+        for path, told in (("none.msh", "there is no file none.msh"), (os.path.join(pulmo.SOURCE, "LICENSE"), "is no mesh that")):
+            code, out, err = called("--check", path)
+            self.assertEqual(code, 1)
+            self.assertIn(told, err)
 
     def test_what_names_mean(self):
         for name, part in (("lung_upper_lobe_left", "left_upper"), ("Right Middle Lobe", "right_middle"), ("RLL", "right_lower"),
