@@ -219,7 +219,7 @@ class Masks(unittest.TestCase):
         mesh, out = self.meshed(changed(bridged), *COARSE)
         self.assertIn("there is only one label: lungs=1", out)
         self.assertIn("cut where they touch", out)
-        self.assertRegex(out, r"1 island of 1\.\d+ ml left out")
+        self.assertRegex(out, r"islands of 1\.\d+ ml left out")
         self.check(mesh, within=0.03)
 
     def test_another_volume_is_a_uniform_scaling(self):

@@ -3,6 +3,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import ndimage
+from skimage.segmentation import watershed
 
 from .label_image import LabelImage
 from .labels import LOBES, side_of
@@ -14,7 +15,7 @@ STEPS = (2, 6)          # of the grid along a cell's edge, least and most
 FEWEST_ACROSS = 12      # voxels across a lung (cube root of its volume) below which it is refused
 FEW_ACROSS = 30         # and below which this is told
 ISLAND = 0.1            # share of a lung's volume above which a second piece is no island
-LARGEST_SEED = 12       # mm that two touching lungs under one label are worn away to find out
+LARGEST_WEAR = 0.3      # of the cube root of their volume, that two touching lungs are worn away to tell them apart
 MARGIN = 6              # grid points around the lungs
 
 
@@ -128,7 +129,8 @@ def split(share, step, say):
     """{side: boolean} of two lungs under one label, by position; they may touch a little."""
     inside = share >= 0.5
     depth = ndimage.distance_transform_edt(inside, sampling=step)
-    for wear in np.arange(0, LARGEST_SEED, step.min()):
+    width = (inside.sum() * np.prod(step)) ** (1 / 3)
+    for wear in np.arange(0, LARGEST_WEAR * width, step.min()):
         seeds, _ = ndimage.label(depth > wear)
         sizes = np.bincount(seeds.ravel())[1:]
         order = np.argsort(-sizes, kind="stable")
@@ -137,17 +139,19 @@ def split(share, step, say):
         if len(sizes) > 1 and sizes[order[1]] > ISLAND * sizes.sum():
             two = [seeds == order[k] + 1 for k in range(2)]
             x = [np.argwhere(one)[:, 0].mean() for one in two]
-            if abs(x[0] - x[1]) * step[0] < 0.25 * (inside.sum() * np.prod(step)) ** (1 / 3):
+            if abs(x[0] - x[1]) * step[0] < 0.25 * width:
                 raise MeshError("the lungs' label has two large pieces that do not lie side by side, so they cannot be a right and a "
                                 "left lung; give each lung a label of its own.")
             right = int(np.argmax(x))
             markers = np.where(two[right], 1, 0) + np.where(two[1 - right], 2, 0)
-            nearest = ndimage.distance_transform_edt(markers == 0, sampling=step, return_distances=False, return_indices=True)
-            grown = markers[tuple(nearest)]
+            around = ndimage.binary_dilation(inside)  # with the voxels that are partly lung
+            grown = watershed(-depth, markers, mask=around)  # they part where the neck between them is thinnest
             say("both lungs have one label: told apart by position" + (
                 f", cut where they touch (worn away by {wear:.1f} mm to find the two)." if wear > 0 else "."))
-            around = ndimage.binary_dilation(inside)  # with the voxels that are partly lung
-            return {"right": (grown == 1) & around, "left": (grown == 2) & around}
+            loose = share[(grown == 0) & around].sum() * np.prod(step) / 1e3
+            if loose > 0:
+                say(f"the lungs: islands of {loose:.3g} ml left out.")
+            return {"right": grown == 1, "left": grown == 2}
     raise MeshError("the lungs' label is one piece that does not come apart in two; if it is one lung only, say which with --labels "
                     "right=NUMBER or left=NUMBER, else give each lung a label of its own.")
 

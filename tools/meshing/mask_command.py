@@ -16,6 +16,7 @@ from .surfaces import volume_name
 SIZE = 12.0             # mm, cells of a pair of DEFAULT_VOLUME
 DEFAULT_VOLUME = 2600   # ml of a pair
 AIRWAY_SIZE = 7.0       # mm, likewise
+CELL = 0.11             # mean volume of the cells over the cube of their size
 RIM_SIZE = 0.55         # of the cells' size elsewhere
 VOLUME_ERROR = 0.01     # of the mask's volume, that a mesh is refused for
 LOBE_ERROR = 0.03       # that is told for a lobe
@@ -52,16 +53,16 @@ def check(given):
 def sizes_for(given, volume, pair):
     """The Sizes of a command line for lungs of a volume (ml)."""
     stretch = (volume / (DEFAULT_VOLUME / (1 if pair else 2))) ** (1 / 3)
-    size = given.size or SIZE * stretch
+    size = given.size or ((volume * 1e3 / (CELL * given.cells)) ** (1 / 3) if given.cells else SIZE * stretch)
     if not 3 * stretch <= size <= 32 * stretch:
-        raise MeshError(f"--size {size:g} mm is no size that lungs of {volume:.0f} ml can be meshed with; it takes about "
+        raise MeshError(f"{f'--cells {given.cells}' if given.cells else f'--size {size:g} mm'} is no size that lungs of {volume:.0f} ml can be meshed with; it takes about "
                         f"{3 * stretch:.2g} to {32 * stretch:.2g} mm.")
     airway = given.airway_size or min(AIRWAY_SIZE * stretch, size)
     rim = given.rim_size or RIM_SIZE * size
     for option, value in (("--airway-size", airway), ("--rim-size", rim)):
         if not stretch <= value <= size:
             raise MeshError(f"{option} {value:g} mm is outside {stretch:.2g} mm to the --size, {size:.3g} mm.")
-    return Sizes(size, airway, rim)
+    return Sizes(size, airway, rim, bool(given.airway_size))
 
 
 def scanned(given, made):
@@ -107,7 +108,7 @@ def make(given, with_cells):
         made.mask |= {volume_name(name): ml * scale**3 for name, ml in lung.lobe_volumes.items()}
     stage("cleaning")
     in_image = made.sizes.times(1 / scale)
-    shapes = surfaces(scan, in_image.general, made.say)
+    shapes = surfaces(scan, in_image.general, scale, made.say)
     stage("surfaces")
     if given.cells:
         told = []
@@ -128,7 +129,8 @@ def compare(mesh, made):
     print("volume                 mesh, mask (ml), difference, share of the lungs")
     for name, wanted in made.mask.items():
         off = found.get(name, 0) / wanted - 1
-        print(f"{name:<22} {found.get(name, 0):.1f}, {wanted:.1f}, {100 * off:+.2f} %, {100 * found.get(name, 0) / total:.1f} %")
+        print(f"{name:<22} {found.get(name, 0):.1f}, {wanted:.1f}, {100 * off:+.2f} %, ".replace("-0.00", "+0.00")
+              + f"{100 * found.get(name, 0) / total:.1f} %")
         if name.endswith("_lung") and abs(off) > VOLUME_ERROR:
             failures.append(f"the {name}'s volume is {100 * off:+.1f} % off the mask's")
         elif abs(off) > LOBE_ERROR:

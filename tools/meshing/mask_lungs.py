@@ -1,6 +1,6 @@
 """Meshes of the lungs of a scan: cells, airway, lobes, volumes, and what holds between the two lungs."""
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,31 +20,33 @@ REACH = 4.0             # mm from the airway's voxels within which the surface i
 LEAST_AIRWAY = 0.2      # of HILUM_AREA, below which the label does not reach the lung
 MOST_AIRWAY = 0.25      # of a lung's surface, above which the label is no airway
 HILUM_HEIGHT = 0.55     # of the lung, from below
-FEW_CELLS = 3           # across the airway's patch
+CELLS_ACROSS = 5        # the airway's patch, at least, where no size is given for it
+FEW_CELLS = 3           # across it, below which this is told
 
 
 @dataclass
 class Sizes:
-    """Edges of cells, mm in the image: in general, at the airway, at sharp borders."""
+    """Edges of cells, mm: in general, at the airway, at sharp borders. fixed: the airway's is not made smaller for a small airway."""
 
     general: float
     airway: float
     rim: float
+    fixed: bool
 
     def times(self, factor):
         """The same multiplied."""
-        return Sizes(self.general * factor, min(self.airway, self.general) * factor, self.rim * factor)
+        return replace(self, general=self.general * factor, airway=self.airway * factor, rim=self.rim * factor)
 
 
 def make_mask_lungs(scan, shapes, sizes, scale, say):
     """The Mesh of a Scan's lungs, in the world's mm, then scaled about the lungs' middle.
 
-    shapes: the surfaces of the lungs. scale: of lengths, for another volume than the image's.
+    shapes: the surfaces of the lungs. sizes: mm in the image. scale: of lengths, for another volume than the image's.
     """
     meshes = []
     for number, (lung, surface) in enumerate(zip(scan.lungs, shapes)):
         other = shapes[1 - number][0].mean(axis=0) if len(shapes) == 2 else None
-        meshes.append(mesh_lung(scan, lung, surface, other, sizes, say))
+        meshes.append(mesh_lung(scan, lung, surface, other, sizes, scale, say))
     mesh = merged(meshes)
     check_apart(meshes)
     middle = mesh.points.mean(axis=0)
@@ -52,20 +54,27 @@ def make_mask_lungs(scan, shapes, sizes, scale, say):
     return mesh
 
 
-def mesh_lung(scan, lung, surface, other, sizes, say):
+def mesh_lung(scan, lung, surface, other, sizes, scale, say):
     """The Mesh of one lung in the world's mm, with the volume of its voxels. other: the middle of the other lung or None."""
     points, triangles = surface
     stretch = (lung.volume / (TEMPLATE_VOLUME / 2)) ** (1 / 3)
-    near, place = airway_places(scan, lung, points, other, stretch, say)
-    reach = REACH * stretch if near is not None else math.sqrt(HILUM_AREA * 100 / math.pi) * stretch
+    area = HILUM_AREA * 100 * stretch**2
+    near, place = airway_places(scan, lung, surface, other, stretch, scale, say)
+    reach = REACH * stretch
+    if near is None:
+        reach = math.sqrt(area / math.pi)
+    else:
+        area = facet_areas(points, triangles)[near[triangles].any(axis=1)].sum()
+    if not sizes.fixed:
+        sizes = replace(sizes, airway=min(sizes.airway, max(math.sqrt(area) / CELLS_ACROSS, sizes.general / 3)))
     places = thinned(points[near] if near is not None else place[None], 2 * scan.step)
     bend = scan.sampled(bending(lung.distance, scan.step), points)
     rim = thinned(points[bend > RIM_BEND / stretch], 2 * scan.step)
 
     def fields(factor):
         own = sizes.times(factor)
-        found = [limit_near(places, own.airway, own.general, reach)]
-        return found + ([limit_near(rim, own.rim, own.general, own.rim)] if len(rim) else [])
+        found = [limit_near(places, min(own.airway, own.general), own.general, reach)]
+        return found + ([limit_near(rim, min(own.rim, own.general), own.general, own.rim)] if len(rim) else [])
 
     nodes, tets = good_tetrahedra(lung.side, points, triangles, fields)
     regions = np.full(len(tets), VOLUMES[lung.side])
@@ -99,21 +108,20 @@ def with_volume(lung, nodes, tets, say):
     return middle + (nodes - middle) * share ** (-1 / 3)
 
 
-def airway_places(scan, lung, points, other, stretch, say):
+def airway_places(scan, lung, surface, other, stretch, scale, say):
     """Surface points (boolean) at the airway's label, or None where it does not reach the lung, and the hilum's place."""
-    if scan.airway is not None:
-        distance = -scan.sampled(scan.airway, points)
-        near = distance < REACH * stretch
-        # a point stands for its share of the surface
-        area = near.mean() * 6 * (lung.volume * 1e3) ** (2 / 3)
-        place = points[np.argmin(distance)]
-        if area > LEAST_AIRWAY * HILUM_AREA * 100 * stretch**2:
-            return near, place
-        say(f"the airway's label comes within {max(distance.min(), 0):.0f} mm of the {lung.side} lung, too far or too little to be its "
-            f"opening: a patch of {HILUM_AREA * stretch**2:.1f} cm2 at the nearest place is the airway.")
-        return None, place
-    place = hilum(lung.side, points, other)
-    say(f"no airway label: a patch of {HILUM_AREA * stretch**2:.1f} cm2 in the middle of the {lung.side} lung's inner side is the airway.")
+    points, triangles = surface
+    patch = f"a patch of {HILUM_AREA * (stretch * scale) ** 2:.1f} cm2"
+    if scan.airway is None:
+        say(f"no airway label: {patch} in the middle of the {lung.side} lung's inner side is the airway.")
+        return None, hilum(lung.side, points, other)
+    distance = -scan.sampled(scan.airway, points)
+    near = distance < REACH * stretch
+    place = points[np.argmin(distance)]
+    if facet_areas(points, triangles)[near[triangles].all(axis=1)].sum() > LEAST_AIRWAY * HILUM_AREA * 100 * stretch**2:
+        return near, place
+    say(f"the airway's label comes within {max(distance.min(), 0):.0f} mm of the {lung.side} lung in the scan, too far or too little to be its "
+        f"opening: {patch} at the nearest place is the airway.")
     return None, place
 
 

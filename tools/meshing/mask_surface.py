@@ -22,15 +22,18 @@ def smooth(scan, size):
         lung.lobes = {name: ndimage.gaussian_filter(distance, width / 2) for name, distance in lung.lobes.items()}
 
 
-def surfaces(scan, size, say):
-    """[(points, triangles)] of the Scan's lungs, mm along the image's axes; makes them smooth first."""
+def surfaces(scan, size, scale, say):
+    """[(points, triangles)] of the Scan's lungs, mm along the image's axes; makes them smooth first.
+
+    size: edge of the cells, mm in the image. scale: of lengths from the image to the mesh, for what is told.
+    """
     smooth(scan, size)
     gap = max(scan.step, GAP * size)
     others = scan.lungs[::-1] if len(scan.lungs) == 2 else [None]
     if len(scan.lungs) == 2:
         overlap = np.max(scan.lungs[0].distance + scan.lungs[1].distance)
         if overlap > -gap:
-            say(f"the lungs touch or nearly do: held {gap:.2g} mm apart.")
+            say(f"the lungs touch or nearly do: held {gap * scale:.2g} mm apart.")
     own = [lung.distance for lung in scan.lungs]
     found = []
     for number, lung in enumerate(scan.lungs):

@@ -81,7 +81,7 @@ def volumes(mesh, mask):
         row = [escaped(name), f"{volume:.1f}", f"{100 * volume / total:.1f} %"]
         if mask:
             wanted = mask.get(name)
-            row += [f"{wanted:.1f}", f"{100 * (volume / wanted - 1):+.2f} %"] if wanted else ["", ""]
+            row += [f"{wanted:.1f}", f"{100 * (volume / wanted - 1):+.2f} %".replace("-0.00", "+0.00")] if wanted else ["", ""]
         rows.append(row)
     rows.append(["all", f"{total:.1f}", "100 %"] + (["", ""] if mask else []))
     return table(["", "mesh, ml", "share"] + (["mask, ml", "difference"] if mask else []), rows)
@@ -115,6 +115,7 @@ def histograms(mesh):
         axes.hist(values, bins=40, color="#3b75af")
         axes.axvline(limit, color="#a00000", linestyle="--")
         axes.set_yscale("log")
+        axes.set_ylim(bottom=0.7)  # one cell shows
         axes.set_xlabel(label)
         axes.set_ylabel("cells")
     drawn.tight_layout()
