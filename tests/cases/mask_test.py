@@ -8,9 +8,11 @@ import re
 import sys
 import unittest
 
+import h5py
 import meshio
 import nibabel
 import numpy as np
+from scipy.io import netcdf_file
 
 import pulmo_case as pulmo
 
@@ -95,6 +97,46 @@ def ellipsoid(middle, fineness=24):
     a, b, c = np.moveaxis(points[triangles], 1, 0)
     inwards = np.sum(a * np.cross(b, c), axis=1) < 0
     return points * HALF + middle, np.where(inwards[:, None], triangles[:, ::-1], triangles)
+
+
+def write_exodus(path, mesh):
+    """An Exodus file (netCDF 3) of a Mesh: a block for each volume, a side set for each surface, with names."""
+    blocks = [(name, np.flatnonzero(mesh.regions == tag)) for (d, tag), name in mesh.names.items() if d == 3]
+    order = np.concatenate([cells for _, cells in blocks])
+    tets = mesh.tets[order]
+    sides = {tuple(sorted(tet[list(face)])): (cell + 1, side + 1) for cell, tet in enumerate(tets)
+             for side, face in enumerate(((0, 1, 3), (1, 2, 3), (0, 2, 3), (0, 1, 2)))}
+    sets = [(name, np.array([sides[tuple(sorted(facet))] for facet in mesh.facets[mesh.surfaces == tag]]))
+            for (d, tag), name in mesh.names.items() if d == 2]
+    with netcdf_file(path, "w", version=2) as file:
+        file.api_version = file.version = np.float32(5)
+        file.floating_point_word_size, file.file_size, file.title = np.int32(8), np.int32(1), "pair"
+        for name, size in (("time_step", None), ("len_string", 33), ("len_name", 33), ("num_dim", 3), ("num_nodes", len(mesh.points)),
+                           ("num_elem", len(tets)), ("num_el_blk", len(blocks)), ("num_side_sets", len(sets))):
+            file.createDimension(name, size)
+
+        def variable(name, values, dimensions, kind):
+            file.createVariable(name, kind, dimensions)[:] = values
+
+        def names_of(groups):
+            return np.array([list(name.ljust(33, chr(0)).encode("latin1")) for name, _ in groups], dtype="u1").view("S1")
+
+        for axis, letter in enumerate("xyz"):
+            variable("coord" + letter, mesh.points[:, axis], ("num_nodes",), "d")
+        for kind, dimension, groups in (("eb", "num_el_blk", blocks), ("ss", "num_side_sets", sets)):
+            variable(f"{kind}_names", names_of(groups), (dimension, "len_name"), "c")
+            variable(f"{kind}_status", np.ones(len(groups)), (dimension,), "i")
+            variable(f"{kind}_prop1", np.arange(1, len(groups) + 1), (dimension,), "i")
+            file.variables[f"{kind}_prop1"].name = "ID"
+        for k, (_, cells) in enumerate(blocks, 1):
+            file.createDimension(f"num_el_in_blk{k}", len(cells))
+            file.createDimension(f"num_nod_per_el{k}", 4)
+            variable(f"connect{k}", mesh.tets[cells] + 1, (f"num_el_in_blk{k}", f"num_nod_per_el{k}"), "i")
+            file.variables[f"connect{k}"].elem_type = "TETRA4"
+        for k, (_, pairs) in enumerate(sets, 1):
+            file.createDimension(f"num_side_ss{k}", len(pairs))
+            variable(f"elem_ss{k}", pairs[:, 0], (f"num_side_ss{k}",), "i")
+            variable(f"side_ss{k}", pairs[:, 1], (f"num_side_ss{k}",), "i")
 
 
 def saved(made, name="labels.nii.gz"):
@@ -327,6 +369,52 @@ class Masks(unittest.TestCase):
             code, out, err = called("--check", path)
             self.assertEqual(code, 1)
             self.assertIn(told, err)
+
+    def test_other_formats_keep_names_and_volumes(self):
+        """A pair of lungs as VTU, as DOLFIN's XDMF and HDF5 and as Exodus comes back as MSH with its volumes, areas and names."""
+        pair = read_mesh(pulmo.mesh("lung_pair.msh"))
+        wanted = self.groups(pair)
+        tri, tet = ("triangle", pair.facets[:, ::-1]), ("tetra", pair.tets)
+        numbers = ",".join(f"{'surface' if d == 2 else 'volume'}:{{}}{tag}={name}" for (d, tag), name in pair.names.items())
+        vtu = pulmo.scratch("pair.vtu")
+        meshio.write(vtu, meshio.Mesh(pair.points, [tri, tet], cell_data={"group": [pair.surfaces, pair.regions]}))
+        cells, faces = pulmo.scratch("mesh.xdmf"), pulmo.scratch("faces.xdmf")
+        meshio.write(cells, meshio.Mesh(pair.points, [tet], cell_data={"f": [pair.regions]}))
+        used, facets = np.unique(pair.facets, return_inverse=True)
+        meshio.write(faces, meshio.Mesh(pair.points[used][::-1], [("triangle", len(used) - 1 - facets.reshape(-1, 3))],
+                                        cell_data={"f": [pair.surfaces]}))
+        dolfin = pulmo.scratch("pair.h5")
+        with h5py.File(dolfin, "w") as file:
+            inner = np.array([pair.tets[0, :3], pair.tets[1, :3]])
+            for name, topology, values in (("mesh", pair.tets, None), ("domains", pair.tets[::-1], pair.regions[::-1]),
+                                           ("boundaries", np.vstack([pair.facets, inner]), np.array([*pair.surfaces, 0, 2**64 - 1], dtype="u8"))):
+                file[f"{name}/topology"], file[f"{name}/coordinates"] = topology, pair.points
+                if values is not None:
+                    file[f"{name}/values"] = values
+        exodus = pulmo.scratch("pair.e")
+        write_exodus(exodus, pair)
+        dolfin_names = ",".join(f"{'boundaries' if d == 2 else 'domains'}_{tag}={name}" for (d, tag), name in pair.names.items())
+        for files, names in (([vtu], numbers.replace("{}", "")), ([cells, faces], numbers.replace("{}", "")), ([dolfin], dolfin_names),
+                             ([exodus], None)):
+            with self.subTest(os.path.basename(files[0])):
+                made = pulmo.scratch("made.msh")
+                code, out, err = called("--convert", *files, "--output", made, *(["--names", names] if names else []))
+                self.assertEqual(code, 0, err)
+                self.assertNotIn("note:", out)
+                found = self.groups(read_mesh(made))
+                self.assertEqual(sorted(found), sorted(wanted))
+                for name, value in wanted.items():
+                    self.assertAlmostEqual(found[name] / value, 1, delta=1e-6, msg=name)
+        code, _, err = called("--check", cells, vtu, "--names", "9=airway")
+        self.assertIn("'9=airway' names no group", err)
+        moved = pulmo.scratch("moved.xdmf")
+        meshio.write(moved, meshio.Mesh(pair.points + 1, [tri], cell_data={"f": [pair.surfaces]}))
+        self.assertIn("is of another mesh", called("--check", cells, moved)[2])
+
+    def groups(self, mesh):
+        """{name: volume or area} of a Mesh."""
+        return {name: tet_volumes(mesh.points, mesh.tets[mesh.regions == tag]).sum() if dimension == 3
+                else facet_areas(mesh.points, mesh.facets[mesh.surfaces == tag]).sum() for (dimension, tag), name in mesh.names.items()}
 
     def test_what_names_mean(self):
         for name, part in (("lung_upper_lobe_left", "left_upper"), ("Right Middle Lobe", "right_middle"), ("RLL", "right_lower"),

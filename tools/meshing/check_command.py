@@ -1,15 +1,21 @@
-"""tools/lung_mesh --check: a mesh of any program in the words of a mesh of its own."""
+"""tools/lung_mesh --check and --convert: a mesh of any program in the words of a mesh of its own."""
 import numpy as np
 
-from .foreign import mesh_of, read_raw
+from .foreign import mesh_of
+from .formats import read_raw, renamed
 from .geometry import facet_areas
 from .report import bodies, measures, print_report, regions
 from .surfaces import patches
 
 
-def check(path):
-    """Prints what a mesh file holds and how good it is; returns the Mesh, the checks that it fails, and the notes."""
-    raw = read_raw(path)
+def check(paths, names):
+    """Prints what a mesh's files hold and how good it is; returns the Mesh, the checks that it fails, and the notes.
+
+    names: --names or None.
+    """
+    raw = read_raw(paths)
+    if names:
+        renamed(raw, names)
     mesh = mesh_of(raw)
     failures = print_report(mesh, measures(mesh))
     areas = facet_areas(mesh.points, mesh.facets) / 100
@@ -39,3 +45,14 @@ def patches_of(mesh, one, name):
     tags = [tag for (dimension, tag), other in mesh.names.items() if dimension == 2 and other == name]
     count, _ = patches(mesh.facets[one.facets & np.isin(mesh.surfaces, tags)])
     return f"{count} patch{'es' if count > 1 else ''}"
+
+
+def with_whole_volume(mesh):
+    """The Mesh with a name for those cells that have none: a file holds what has a name only."""
+    nameless = ~np.isin(mesh.regions, [tag for dimension, tag in mesh.names if dimension == 3])
+    if nameless.any():
+        tag = max([tag for _, tag in mesh.names] + [int(mesh.regions.max())]) + 1
+        name = "lung" if nameless.all() else "rest"
+        mesh.regions = np.where(nameless, tag, mesh.regions)
+        mesh.names[3, tag] = name
+    return mesh

@@ -1,7 +1,4 @@
 """Meshes that other programs wrote: read with their names, checked in the words of lung_mesh, converted to MSH."""
-import contextlib
-import os
-import xml.etree.ElementTree
 from dataclasses import dataclass, field
 
 import gmsh
@@ -27,18 +24,6 @@ class Raw:
     groups: np.ndarray
     names: dict
     notes: list = field(default_factory=list)
-
-
-def read_raw(path):
-    """The Raw of a mesh file: MSH by gmsh, others by meshio."""
-    if not os.path.isfile(path):
-        raise MeshError(f"there is no file {path}.")
-    raw = read_msh(path) if path.endswith(".msh") else read_meshio(path)
-    if not len(raw.tets):
-        raise MeshError(f"{path} holds no tetrahedra.")
-    if not np.isfinite(raw.points).all():
-        raise MeshError(f"{path} holds nodes whose coordinates are no numbers.")
-    return raw
 
 
 def read_msh(path):
@@ -135,26 +120,3 @@ def torn(points, facets):
     extent = np.ptp(points, axis=0).max()
     _, count = np.unique(np.round(points[nodes] / (1e-6 * extent)), axis=0, return_counts=True)
     return int(count[count > 1].sum())
-
-
-def read_meshio(path):
-    """The Raw of a file that meshio reads."""
-    import meshio
-
-    try:
-        with contextlib.redirect_stdout(None):
-            read = meshio.read(path)
-    except (Exception, SystemExit) as error:  # each format of meshio's raises kinds of its own
-        raise MeshError(f"{path} is no mesh that meshio reads ({str(error) or type(error).__name__}).") from error
-    tags = next((data for name, data in read.cell_data.items() if name in ("gmsh:physical", "medit:ref", "cell_tags", "f")), None)
-    names = {(int(dimension), int(tag)): name for name, (tag, dimension) in read.field_data.items()}
-    parts = {2: [], 3: []}
-    for number, block in enumerate(read.cells):
-        dimension = {"triangle": 2, "tetra": 3}.get(block.type)
-        if dimension:
-            parts[dimension].append((block.data, tags[number] if tags is not None else np.zeros(len(block.data), int)))
-    for dimension in parts:
-        for _, groups in parts[dimension]:
-            for tag in np.unique(groups[groups != 0]):
-                names.setdefault((dimension, int(tag)), str(tag))
-    return joined(read.points, parts, names, [])

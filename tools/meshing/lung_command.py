@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from . import mask_command
-from .check_command import check
+from .check_command import check, with_whole_volume
 from .geometry import tet_volumes
 from .labels import EXAMPLE, PARTS
 from .lungs import SIDES, Options, make_lungs
@@ -99,8 +99,12 @@ def parse(arguments):
     kind.add_argument("--binary", action="store_true", help="write binary")
     parser.add_argument("--picture", metavar="FILE.png", help="draw the mesh too")
     parser.add_argument("--report", metavar="FILE.html", help="write a page about the mesh: volumes, areas, quality, picture")
-    parser.add_argument("--check", metavar="FILE", help=(
-        "make nothing, but tell what another mesh (MSH, or what meshio reads) holds and whether it would pass; --picture and --report as above"))
+    other = parser.add_argument_group("a mesh of another program")
+    other.add_argument("--check", nargs="+", metavar="FILE", help=(
+        "make nothing, but tell what another mesh holds and whether it would pass (MSH, DOLFIN's HDF5, Exodus, VTU, XDMF, what meshio reads; "
+        "several files if cells and groups lie in files of their own)"))
+    other.add_argument("--convert", nargs="+", metavar="FILE", help="the same, and write it to --output, even if it would not pass, with its names")
+    other.add_argument("--names", metavar="OLD=NEW,...", help="give its groups other names, as in 1=airway,2=pleura")
     return parser.parse_args(arguments)
 
 
@@ -195,10 +199,27 @@ def made(given):
         failures = print_report(mesh, measures(mesh)) + mask_command.compare(mesh, source)
         mask_command.print_times(source)
         return mesh, failures, source.notes, source.mask
+    if given.names:
+        raise MeshError("--names has no meaning without --check or --convert.")
     if given.labels or given.rim_size:
         raise MeshError(f"{'--labels' if given.labels else '--rim-size'} has no meaning without --mask.")
     mesh = mesh_of(given, filled_in(given))
     return mesh, print_report(mesh, measures(mesh)), [], None
+
+
+def checked(given):
+    """Checks a mesh of another program, and converts it if that is asked for; returns the exit code."""
+    files = given.check or given.convert
+    mesh, failures, notes = check(files, given.names)
+    show(given, mesh, os.path.basename(files[0]), failures, notes)
+    if given.convert:
+        write_mesh(with_whole_volume(mesh), given.output, float(given.format), given.binary, digits=16)
+        print(f"wrote {given.output}" + (", although " + "; ".join(failures) if failures else ""))
+    elif failures:
+        raise MeshError("; ".join(failures) + ".")
+    else:
+        print("passes all checks")
+    return 0
 
 
 def show(given, mesh, title, failures, notes, mask=None):
@@ -214,13 +235,8 @@ def main(arguments):
     given = parse(arguments)
     try:
         check_files(given)
-        if given.check:
-            mesh, failures, notes = check(given.check)
-            show(given, mesh, os.path.basename(given.check), failures, notes)
-            if failures:
-                raise MeshError("; ".join(failures) + ".")
-            print("passes all checks")
-            return 0
+        if given.check or given.convert:
+            return checked(given)
         mesh, failures, notes, mask = made(given)
         show(given, mesh, os.path.basename(given.output), failures, notes, mask)
         if failures:
