@@ -50,7 +50,7 @@ def end_of(side):
 def anatomy(x):
     """Labels at places (..., 3) of the world: two ellipsoids, a trachea that runs along the right lung's apex and forks."""
     labels = np.zeros(x.shape[:-1], np.uint8)
-    tube = near_line(x, FORK + (0, 0, 60), FORK, 7)
+    tube = near_line(x, FORK + (52, 0, 50), FORK, 9)
     for side in MIDDLE:
         tube |= near_line(x, FORK, end_of(side), 6)
     labels[tube] = TUBE
@@ -191,6 +191,7 @@ class Masks(unittest.TestCase):
         self.assertEqual(len(mesh.facets), len(boundary_facets(mesh.tets)))
         airway = mesh.facets[mesh.surfaces == tags["airway"]]
         self.assertGreater(len(airway), 4)
+        self.assertLess(np.abs(mesh.points[airway, 0]).max(), 45, "on the lungs' inner sides")
         return mesh.points[airway].mean(axis=1), facet_areas(mesh.points, airway)
 
     def test_two_lungs_and_a_trachea(self):
@@ -263,6 +264,21 @@ class Masks(unittest.TestCase):
         self.assertIn("cut where they touch", out)
         self.assertRegex(out, r"islands of 1\.\d+ ml left out")
         self.check(mesh, within=0.03)
+
+    def test_lungs_with_a_common_face_are_held_apart(self):
+        """Voxels of right and left side by side: the meshes keep their volumes and a gap, which is told."""
+        def pressed(x):
+            right = x[..., 0] > 1.5  # between voxels
+            centre = np.where(right[..., None], (36, -5, 20), (-33, -5, 20))
+            return np.where(np.sum(((x - centre) / HALF) ** 2, axis=-1) < 1, np.where(right, RIGHT, LEFT), 0)
+        mesh, out = self.meshed(saved(image(pressed)), *COARSE)
+        told = float(re.search(r"the lungs touch or nearly do: held ([0-9.]+) mm apart", out)[1])
+        tags = {name: tag for (_, tag), name in mesh.names.items()}
+        right, left = (mesh.points[mesh.tets[mesh.regions == tags[side + "_lung"]]][..., 0] for side in MIDDLE)
+        self.assertGreater(right.min() - left.max(), 0.4 * told)
+        self.assertLess(right.min() - left.max(), 1.5 * told)
+        for side in MIDDLE:
+            self.assertRegex(out, side + r"_lung *[0-9.]+, [0-9.]+, [+]0.00 %")
 
     def test_another_volume_is_a_uniform_scaling(self):
         """--volume scales about the middle and says what that assumes; --cells counts."""
@@ -446,6 +462,7 @@ class Masks(unittest.TestCase):
         plain = saved(image())
         for words, told in (
                 ([changed(lambda v: v * 0)], "is empty: every voxel is 0"),
+                ([saved(nibabel.Nifti1Image(np.ones((40, 40, 1), np.uint8), np.eye(4)), "flat.nii.gz")], "is a flat image of 40 x 40 x 1"),
                 ([four], "has 4 dimensions (4 x 4 x 4 x 2); it takes one image of three"),
                 ([ct], "so it is a CT or the like and no label image"),
                 ([saved(nibabel.Nifti1Image(np.random.default_rng(1).random((9, 9, 9)), np.eye(4)), "p.nii.gz")], "values with decimals"),

@@ -77,6 +77,8 @@ def load(path, say):
         elif len(shape) != 3:
             raise MeshError(f"--mask {path} has {len(shape)} dimensions ({' x '.join(map(str, shape))}); it takes one image of "
                             "three, so save one time or one channel.")
+        if min(shape[:3]) < 3:
+            raise MeshError(f"--mask {path} is a flat image of {' x '.join(map(str, shape[:3]))} voxels; it takes a whole chest.")
         if image.header["qform_code"] == 0 and image.header["sform_code"] == 0:
             say(f"{path} says nothing about its orientation (qform_code and sform_code are 0): left and right are taken as NIfTI's "
                 "default (voxels stored from right to left); check them.")

@@ -48,6 +48,11 @@ def side_of(part):
     return next((side for side in LOBES if part.startswith(side)), None)
 
 
+def is_pair(parts):
+    """Whether the parts are those of both lungs."""
+    return "lungs" in parts or {side_of(part) for part in parts} >= set(LOBES)
+
+
 def listed(present):
     """What there is, for a message. present: the Labels of an image."""
     shown = sorted(present, key=lambda number: -present[number].volume)[:12]

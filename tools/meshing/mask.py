@@ -6,7 +6,7 @@ from scipy import ndimage
 from skimage.segmentation import watershed
 
 from .label_image import LabelImage
-from .labels import LOBES, side_of
+from .labels import LOBES, is_pair, side_of
 from .mesh import MeshError
 
 GRID = 2.25             # mm between points for a lung of GRID_VOLUME; its surface has about 40,000 triangles
@@ -57,28 +57,28 @@ class Scan:
 
 def read_scan(image, parts, size, say):
     """The Scan of a LabelImage; parts: {part: numbers}; size: edge of the mesh's cells, mm in the image."""
-    wanted = np.isin(np.arange(image.values.max() + 1), [n for numbers in parts.values() for n in numbers])
-    lungs_only = np.isin(np.arange(image.values.max() + 1),
-                         [n for part, numbers in parts.items() if part != "airway" for n in numbers])
+    numbers = np.arange(int(image.values.max()) + 1)
+    wanted = np.isin(numbers, sum(parts.values(), []))
+    lungs_only = np.isin(numbers, sum((labels for part, labels in parts.items() if part != "airway"), []))
     box = ndimage.find_objects(lungs_only[image.values].astype(np.uint8))[0]
-    at_edge = [axis for axis in range(3) if box[axis].start == 0 or box[axis].stop == image.values.shape[axis]]
-    if at_edge:
-        say("the lungs reach the image's edge" + (", where they may be cut off" if image.values.shape[2] > 1 else "") + ": look whether "
-            "the whole lung is there.")
+    if any(side.start == 0 or side.stop == count for side, count in zip(box, image.values.shape)):
+        say("the lungs reach the image's edge, where they may be cut off: look whether all of them is there.")
     voxels = np.count_nonzero(lungs_only[image.values[box]])
     volume = voxels * np.prod(image.spacing) / 1e3
-    pair = any(side_of(part) == "right" for part in parts) and any(side_of(part) == "left" for part in parts) or "lungs" in parts
-    check_resolution(volume / (2 if pair else 1), image.spacing, say)
-    grid = GRID * (volume / (2 if pair else 1) / GRID_VOLUME) ** (1 / 3)
+    each = volume / (2 if is_pair(parts) else 1)
+    check_resolution(each, image.spacing, say)
+    grid = GRID * (each / GRID_VOLUME) ** (1 / 3)
     grid = np.clip(grid, size / STEPS[1], size / STEPS[0])
     factors = np.maximum(np.floor(grid / image.spacing + 0.01), 1).astype(int)
     shares, start = averaged(image, parts, box, factors, wanted)
     step = image.spacing * factors
     lungs = [one_lung(side, wholes, step, say) for side, wholes in sides_of(shares, step, say).items()]
     airway = shares.get("airway")
+    if airway is not None and airway.max() == 0:
+        say("the airway's label lies apart from the lungs, above or below all of them, so it is left out.")
+        airway = None
     if airway is not None:
-        airway = below_trachea(airway >= min(0.5, airway.max()), step, say)
-        airway = None if airway is None else signed_distance(airway, step)
+        airway = signed_distance(below_trachea(airway >= min(0.5, airway.max()), step, say), step)
     for lung in lungs:
         lung.distance = on_grid(lung.distance, step, grid)
         lung.lobes = {name: on_grid(distance, step, grid) for name, distance in lung.lobes.items()}
@@ -193,7 +193,7 @@ def one_lung(side, shares, step, say):
 
 
 def below_trachea(airway, step, say):
-    """The airway (boolean) without the trachea, which touches the lungs above their roots; None if nothing is left.
+    """The airway (boolean) without the trachea, which touches the lungs above their roots.
 
     The trachea is followed downwards from its top until it forks.
     """

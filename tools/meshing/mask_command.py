@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 from .geometry import tet_volumes
 from .label_image import check_sides, read_labels
-from .labels import find_parts, side_of
+from .labels import find_parts, is_pair
 from .mask import read_scan
 from .mask_lungs import Sizes, make_mask_lungs
 from .mask_surface import surfaces
@@ -65,8 +65,8 @@ def sizes_for(given, volume, pair):
     return Sizes(size, airway, rim, bool(given.airway_size))
 
 
-def scanned(given, made):
-    """The LabelImage that the command line names, its {part: numbers}, the volume of its lungs (ml), and whether both are there."""
+def read_input(given, made):
+    """The LabelImage that the command line names, its {part: numbers}, and the volume of its lungs, ml."""
     if given.surface:
         image, parts = read_surfaces(given.surface, made.say)
         present = image.labels()
@@ -75,8 +75,7 @@ def scanned(given, made):
         parts = find_parts(present, image.names, given.labels, made.say)
     check_sides(parts, present, made.source)
     volume = sum(present[n].volume for part, numbers in parts.items() if part != "airway" for n in numbers)
-    sides = {side_of(part) for part in parts} - {None}
-    return image, parts, volume, len(sides) == 2 or "lungs" in parts
+    return image, parts, volume
 
 
 def make(given, with_cells):
@@ -90,9 +89,9 @@ def make(given, with_cells):
         made.seconds[name] = now - clock
         clock = now
 
-    image, parts, volume, pair = scanned(given, made)
+    image, parts, volume = read_input(given, made)
     wanted = given.volume or volume
-    made.sizes = sizes_for(given, wanted, pair)
+    made.sizes = sizes_for(given, wanted, is_pair(parts))
     scale = (wanted / volume) ** (1 / 3)
     stage("reading")
     scan = read_scan(image, parts, made.sizes.general / scale, made.say)

@@ -1,6 +1,11 @@
 """A picture of a lung mesh."""
 import numpy as np
 
+from .report import cells_of
+
+PLEURA = (0.93, 0.62, 0.58)
+LOBE_COLOURS = [PLEURA, (0.94, 0.85, 0.55), (0.60, 0.80, 0.70), (0.80, 0.68, 0.85), (0.80, 0.78, 0.72)]
+
 
 def picture(mesh, path):
     """Save a picture of a lung Mesh."""
@@ -38,7 +43,7 @@ def draw(axes, mesh, towards_eye, opacity):
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     tags = [tag for (dimension, tag), name in mesh.names.items() if dimension == 2 and name == "airway"]
     airway = np.isin(mesh.surfaces, tags)
-    colours = np.where(airway[:, None], (0.16, 0.45, 0.75), (0.93, 0.62, 0.58))
+    colours = np.where(airway[:, None], (0.16, 0.45, 0.75), pleura_colours(mesh))
     facing = normals @ eye > 0
     shade = 0.55 + 0.45 * np.clip(np.abs(normals @ light) / np.linalg.norm(light), 0, 1)
     depth = np.argsort((corners @ eye).mean(axis=1))
@@ -51,3 +56,12 @@ def draw(axes, mesh, towards_eye, opacity):
     axes.autoscale()
     axes.set_aspect("equal")
     axes.axis("off")
+
+
+def pleura_colours(mesh):
+    """The colour of each boundary triangle where it is no airway: one for lungs, one for each lobe where there are lobes."""
+    volumes = [tag for dimension, tag in mesh.names if dimension == 3]
+    if not any(name.endswith("_lobe") for name in mesh.names.values()):
+        return np.array(PLEURA)
+    place = np.searchsorted(np.sort(volumes), mesh.regions[cells_of(mesh.tets, mesh.facets)])
+    return np.array(LOBE_COLOURS)[place % len(LOBE_COLOURS)]
