@@ -53,6 +53,7 @@ def anatomy(x):
     tube = near_line(x, FORK + (52, 0, 50), FORK, 9)
     for side in MIDDLE:
         tube |= near_line(x, FORK, end_of(side), 6)
+    tube |= np.linalg.norm(x - MIDDLE["right"] - (HALF[0] + 3, 0, -10), axis=-1) < 6  # a bit at the right lung's outer side
     labels[tube] = TUBE
     labels[in_lung(x, "right")] = RIGHT
     labels[in_lung(x, "left")] = LEFT
@@ -216,7 +217,7 @@ class Masks(unittest.TestCase):
         """LPS voxels, a mirrored matrix with swapped axes, oblique thick slices: right stays right, volumes and middles stay."""
         a = 0.3
         oblique_axes = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]]) @ np.diag([-1, -1, 1])
-        swapped = np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]])[:, [1, 0, 2]]  # det -1
+        swapped = np.array([[0, 1, 0], [0, 0, -1], [1, 0, 0]])
         self.assertLess(np.linalg.det(swapped), 0)
         for what, words in (("LPS, thick slices", dict(axes=oblique_axes, spacing=(2, 2, 6))),
                             ("mirrored and swapped", dict(axes=swapped, spacing=(3.5, 3, 3)))):
@@ -446,6 +447,10 @@ class Masks(unittest.TestCase):
             values[50:60, 10:40, 5:25] = RIGHT
             values[50:60, 10:40, 40:60] = RIGHT
 
+        def halves(values):  # of one lung
+            values[values != RIGHT] = 0
+            values[:, :, 34:][values[:, :, 34:] == RIGHT] = 2
+
         def tunnel(values):
             values[30:80, 20:30, 25:38] = 0
 
@@ -469,6 +474,7 @@ class Masks(unittest.TestCase):
                 ([none], "is no NIfTI file that can be read"),
                 (["none.nii.gz"], "there is no such file"),
                 ([three], "it cannot be told which labels are the lungs; there are 21 ("),
+                ([changed(halves)], "it cannot be told which labels are the lungs; there are 1 ("),
                 ([plain, "--labels", "right=1,left=7"], "--labels left=7: no voxel has label 7; there are 1 ("),
                 ([plain, "--labels", "right=1,liver=2"], "'liver=2' is no PART=NUMBER"),
                 ([plain, "--labels", "right=1,left=1"], "label 1 is named twice"),
