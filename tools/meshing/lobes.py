@@ -13,7 +13,7 @@ def lobes_of(points, tets, distances):
 
     distances: function from points (n, 3) to the distance into each lobe (lobes, n).
     """
-    lobe = one_piece_each(tets, distances(points[tets].mean(axis=1)).argmax(axis=0), len(distances(points[:1])))
+    lobe = one_piece_each(tets, distances(points[tets].mean(axis=1)).argmax(axis=0))
     points = fitted(points, tets, lobe, distances)
     return points, lobe
 
@@ -35,15 +35,14 @@ def pieces(tets, keep=None):
     return sparse.csgraph.connected_components(graph, directed=False)[1]
 
 
-def one_piece_each(tets, lobe, count):
+def one_piece_each(tets, lobe):
     """The lobe of each tetrahedron, where bits that hang apart from the rest of their lobe go to the lobe around them."""
     pairs = neighbours(tets)
     pairs = np.concatenate([pairs, pairs[:, ::-1]])
     lobe = lobe.copy()
     for _ in range(20):
         piece = pieces(tets, lobe)
-        sizes = np.bincount(piece)
-        largest = [np.argmax(np.where(np.isin(np.arange(len(sizes)), piece[lobe == k]), sizes, 0)) for k in range(count) if (lobe == k).any()]
+        largest = [np.bincount(piece[lobe == k]).argmax() for k in np.unique(lobe)]
         loose = ~np.isin(piece, largest)
         if not loose.any():
             break

@@ -28,8 +28,7 @@ class Made:
     """What was made of a mask: how, out of what, and what was told on the way."""
 
     source: str
-    mask: dict          # {name: ml} of lungs and lobes
-    scale: float = 1.0
+    mask: dict          # {name: ml} of lungs and lobes, mended, at the mesh's volume
     sizes: Sizes = None
     notes: list = field(default_factory=list)
     seconds: dict = field(default_factory=dict)
@@ -55,8 +54,9 @@ def sizes_for(given, volume, pair):
     stretch = (volume / (DEFAULT_VOLUME / (1 if pair else 2))) ** (1 / 3)
     size = given.size or ((volume * 1e3 / (CELL * given.cells)) ** (1 / 3) if given.cells else SIZE * stretch)
     if not 3 * stretch <= size <= 32 * stretch:
-        raise MeshError(f"{f'--cells {given.cells}' if given.cells else f'--size {size:g} mm'} is no size that lungs of {volume:.0f} ml can be meshed with; it takes about "
-                        f"{3 * stretch:.2g} to {32 * stretch:.2g} mm.")
+        asked = f"--cells {given.cells}, about {size:.2g} mm," if given.cells else f"--size {size:g} mm"
+        raise MeshError(f"{asked} is no size that lungs of {volume:.0f} ml can be meshed with; it takes about {3 * stretch:.2g} to "
+                        f"{32 * stretch:.2g} mm.")
     airway = given.airway_size or min(AIRWAY_SIZE * stretch, size)
     rim = given.rim_size or RIM_SIZE * size
     for option, value in (("--airway-size", airway), ("--rim-size", rim)):
@@ -78,6 +78,14 @@ def read_input(given, made):
     return image, parts, volume
 
 
+def tell_mended(scan, volume, say):
+    """Tells if islands, holes and gaps made a difference to the volume; volume: of all lung labels, ml."""
+    mended = sum(lung.volume for lung in scan.lungs)
+    if abs(mended / volume - 1) > VOLUME_ERROR:
+        say(f"with islands left out and holes and gaps filled the lungs have {mended:.0f} ml; their labels have {volume:.0f} ml.")
+    return mended
+
+
 def make(given, with_cells):
     """The Mesh that the command line asks for, and its Made. with_cells: as in lung_command."""
     made = Made("--mask " + given.mask if given.mask else "--surface " + " ".join(given.surface), {})
@@ -95,13 +103,12 @@ def make(given, with_cells):
     scale = (wanted / volume) ** (1 / 3)
     stage("reading")
     scan = read_scan(image, parts, made.sizes.general / scale, made.say)
-    volume = sum(lung.volume for lung in scan.lungs)
+    volume = tell_mended(scan, volume, made.say)
     if given.volume:
         scale = (wanted / volume) ** (1 / 3)
         made.say(f"--volume {wanted:.0f} ml: the scan's {volume:.0f} ml times {scale:.4f} in every direction about the middle of the "
                  "lungs. That assumes that the lungs have the same shape at both volumes; real ones do not quite (the diaphragm moves "
                  "more than the ribs), and the mesh no longer lies on the image.")
-    made.scale = scale
     for lung in scan.lungs:
         made.mask[volume_name(lung.side)] = lung.volume * scale**3
         made.mask |= {volume_name(name): ml * scale**3 for name, ml in lung.lobe_volumes.items()}

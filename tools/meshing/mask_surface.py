@@ -29,16 +29,15 @@ def surfaces(scan, size, scale, say):
     """
     smooth(scan, size)
     gap = max(scan.step, GAP * size)
-    others = scan.lungs[::-1] if len(scan.lungs) == 2 else [None]
-    if len(scan.lungs) == 2:
-        overlap = np.max(scan.lungs[0].distance + scan.lungs[1].distance)
-        if overlap > -gap:
-            say(f"the lungs touch or nearly do: held {gap * scale:.2g} mm apart.")
-    own = [lung.distance for lung in scan.lungs]
-    found = []
-    for number, lung in enumerate(scan.lungs):
+    distances = [lung.distance for lung in scan.lungs]
+    limits = [None] * len(distances)
+    if len(distances) == 2:
         # half way between the lungs, less half the gap
-        limit = (own[number] - own[1 - number] - gap) / 2 if others[0] else None
+        limits = [(one - other - gap) / 2 for one, other in (distances, distances[::-1])]
+        if np.max(sum(distances)) > -gap:
+            say(f"the lungs touch or nearly do: held {gap * scale:.2g} mm apart.")
+    found = []
+    for lung, limit in zip(scan.lungs, limits):
         lung.distance = one_genus(lung, limit, scan.step, say)
         found.append(as_large(lung, limit, scan))
     return found
