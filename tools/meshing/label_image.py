@@ -86,7 +86,8 @@ def load(path, say):
     except MeshError:
         raise
     except Exception as error:  # nibabel, gzip and zlib raise many kinds
-        raise MeshError(f"--mask {path} is no NIfTI file that can be read ({str(error) or type(error).__name__}).") from error
+        raise MeshError(f"--mask {path} is no NIfTI file that can be read ({str(error) or type(error).__name__}); save the labels "
+                        "as NIfTI (.nii.gz).") from error
 
 
 def whole_numbers(image, path):

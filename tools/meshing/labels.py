@@ -121,22 +121,21 @@ def find_parts(present, names, asked, say):
     present: {number: Label}. names: {number: name} that came with the file. asked: --labels or None. say: tells a note.
     """
     if asked:
-        parts = from_option(asked, present, names)
-    else:
-        parts, known = from_names(names, present, say), "the names that come with the file"
-        if not any(part != "airway" for part in parts):
-            parts, known = from_numbers(present)
-        if not parts and len(present) == 1:
-            parts, known = {"lungs": list(present)}, "there is only one label"
-        if not parts:
-            raise MeshError(f"it cannot be told which labels are the lungs; there are {listed(present)}: say it, as in {EXAMPLE}.")
-        meant = ", ".join(f"{part}={'+'.join(map(str, numbers))}" for part, numbers in parts.items())
-        say(f"labels as {known}: {meant}." if known in NUMBERS else f"labels by {known}: {meant}."
-            if "names" in known else f"{known}: {meant}.")
-        unused = {n: label for n, label in present.items() if not any(n in numbers for numbers in parts.values())}
-        if unused:
-            say(f"not used: {listed(unused)}" + ("" if "airway" in parts else "; if some are bronchi or trachea, name them "
-                                                "with --labels ...,airway=NUMBER") + ".")
+        return checked(from_option(asked, present, names))
+    parts, how = from_names(names, present, say), "labels by the names that come with the file"
+    if not any(part != "airway" for part in parts):
+        parts, program = from_numbers(present)
+        how = f"labels as {program}"
+    if not parts and len(present) == 1:
+        parts, how = {"lungs": list(present)}, "there is only one label"
+    if not parts:
+        raise MeshError(f"it cannot be told which labels are the lungs; there are {listed(present)}: say it, as in {EXAMPLE}.")
+    say(how + ": " + ", ".join(f"{part}={'+'.join(map(str, numbers))}" for part, numbers in parts.items()) + ".")
+    used = sum(parts.values(), [])
+    unused = {number: label for number, label in present.items() if number not in used}
+    if unused:
+        hint = "" if "airway" in parts else "; if some are bronchi or trachea, name them with --labels ...,airway=NUMBER"
+        say(f"not used: {listed(unused)}{hint}.")
     return checked(parts)
 
 

@@ -3,6 +3,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import spatial
 
 from .geometry import boundary_facets, facet_areas, orient, tet_volumes
 from .lobes import lobes_of
@@ -169,10 +170,10 @@ def check_apart(meshes):
 
 
 def contains(mesh, points):
-    """Which points (n, 3) are inside a closed Mesh, by the solid angle of its surface; only those in its box are worked out."""
-    low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
-    found = ((points > low) & (points < high)).all(axis=1)
+    """Which points (n, 3), of those near its surface, are inside a closed Mesh, by the solid angle of the surface."""
     triangles = mesh.points[mesh.facets]
+    longest = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max()
+    found = spatial.cKDTree(mesh.points).query(points)[0] < longest
     for row in np.flatnonzero(found):
         a, b, c = np.moveaxis(triangles - points[row], 1, 0)
         la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
