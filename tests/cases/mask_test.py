@@ -497,6 +497,8 @@ class Masks(unittest.TestCase):
                 self.assertFalse(os.path.exists(mesh))
         for words in (["--labels", "right=1"], ["--rim-size", "5"]):
             self.assertIn("has no meaning without --mask", called(*words, "--output", mesh)[2])
+        self.assertIn("--names has no meaning without --check or --convert", called("--names", "1=airway", "--output", mesh)[2])
+        self.assertIn("--mask and --check do not go together", called("--mask", plain, "--check", plain, "--output", mesh)[2])
         # an unknown orientation is told, and its default contradicts labels that are the other way round
         out = called("--mask", saved(unknown), "--labels", "right=1,left=2", "--output", mesh)
         self.assertIn("says nothing about its orientation", out[1])

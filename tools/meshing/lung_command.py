@@ -88,7 +88,8 @@ def parse(arguments):
     parser.add_argument("--airway", choices=list(AIRWAY_SIZE),
                         help="a hilum patch, a carved main bronchus, or carved lobar bronchi too (default: main)")
     parser.add_argument("--airway-size", type=positive, metavar="MM", help=(
-        "element size at the airway, mm (default: " + ", ".join(f"{a} {h:g}" for a, h in AIRWAY_SIZE.items()) + ")"))
+        "element size at the airway, mm (default: " + ", ".join(f"{a} {h:g}" for a, h in AIRWAY_SIZE.items())
+        + f"; with --mask {mask_command.AIRWAY_SIZE:g}, less at a small airway)"))
     parser.add_argument("--bronchus-radius", type=positive, metavar="MM", help=(
         "radius of the carved main bronchi, mm in a pair of "
         f"{TEMPLATE_VOLUME:g} ml (default: {BRONCHUS_RADIUS:g}; sets the airway's area)"))
@@ -115,6 +116,16 @@ def check_files(given):
         folder = os.path.dirname(path or "") or "."
         if path and not (path.endswith(ending) and os.path.isdir(folder) and os.access(folder, os.W_OK)):
             raise MeshError(f"{option} {path} must be a {ending} file in a folder that can be written to.")
+
+
+def check_route(given):
+    """Refuses a command line that asks for two things at a time."""
+    routes = [option for option in ("mask", "surface", "check", "convert") if getattr(given, option)]
+    if len(routes) > 1:
+        raise MeshError(f"--{routes[0]} and --{routes[1]} do not go together; give one.")
+    for option, needed in (("names", ("check", "convert")), ("labels", ("mask",)), ("rim_size", ("mask", "surface"))):
+        if getattr(given, option) and not set(routes) & set(needed):
+            raise MeshError(f"--{option.replace('_', '-')} has no meaning without --{' or --'.join(needed)}.")
 
 
 def check_request(given, volume, stretch):
@@ -199,10 +210,6 @@ def made(given):
         failures = print_report(mesh, measures(mesh)) + mask_command.compare(mesh, source)
         mask_command.print_times(source)
         return mesh, failures, source.notes, source.mask
-    if given.names:
-        raise MeshError("--names has no meaning without --check or --convert.")
-    if given.labels or given.rim_size:
-        raise MeshError(f"{'--labels' if given.labels else '--rim-size'} has no meaning without --mask.")
     mesh = mesh_of(given, filled_in(given))
     return mesh, print_report(mesh, measures(mesh)), [], None
 
@@ -235,6 +242,7 @@ def main(arguments):
     given = parse(arguments)
     try:
         check_files(given)
+        check_route(given)
         if given.check or given.convert:
             return checked(given)
         mesh, failures, notes, mask = made(given)

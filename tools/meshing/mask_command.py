@@ -42,9 +42,7 @@ class Made:
 def check(given):
     """Refuses options that have no meaning here."""
     route = "--mask" if given.mask else "--surface"
-    if given.mask and given.surface:
-        raise MeshError("--mask and --surface are two ways to say the same; give one.")
-    for option in NOT_WITH + (["labels"] if given.surface else []):
+    for option in NOT_WITH:
         if getattr(given, option):
             raise MeshError(f"--{option.replace('_', '-')} has no meaning with {route}.")
 
