@@ -8,6 +8,7 @@ import re
 import sys
 import unittest
 
+import gmsh
 import h5py
 import meshio
 import nibabel
@@ -19,6 +20,7 @@ import pulmo_case as pulmo
 sys.path.insert(0, os.path.join(pulmo.SOURCE, "tools"))
 from meshing import lung_command  # noqa: E402
 from meshing.geometry import boundary_facets, facet_areas, tet_volumes  # noqa: E402
+from meshing.gmsh_model import gmsh_session  # noqa: E402
 from meshing.labels import part_of  # noqa: E402
 from meshing.msh import read_mesh  # noqa: E402
 from meshing.quality import dihedral_angles, sicn  # noqa: E402
@@ -382,6 +384,26 @@ class Masks(unittest.TestCase):
         code, out, err = checked(double, np.vstack([tets, tets + len(points)]), np.vstack([triangles, triangles + len(points)]),
                                  np.concatenate([tags, tags]), names)
         self.assertIn("are not joined (a tear)", out)
+        # what pulmo refuses
+        code, out, err = checked(points, tets, np.vstack([triangles, [[0, 1, 2]]]), np.append(tags, 2), names)
+        self.assertIn("1 triangles are no faces of cells", err)
+        curved, twice = pulmo.scratch("curved.msh"), pulmo.scratch("twice.msh")
+        with gmsh_session():
+            gmsh.model.occ.addBox(0, 0, 0, 130, 130, 130)
+            gmsh.model.occ.synchronize()
+            gmsh.option.setNumber("Mesh.MeshSizeMax", 70)
+            for sides, name in (([2], "airway"), ([1, 3, 4, 5, 6], "pleura"), ([2, 3], "other")):
+                gmsh.model.setPhysicalName(2, gmsh.model.addPhysicalGroup(2, sides), name)
+            gmsh.model.addPhysicalGroup(3, [1])
+            gmsh.model.mesh.generate(3)
+            gmsh.write(twice)
+            gmsh.model.mesh.setOrder(2)
+            gmsh.write(curved)
+        self.assertIn("some faces are in 2 groups (airway, other)", called("--check", twice)[2])
+        self.assertIn("elements are of higher order", called("--check", curved)[2])
+        made = pulmo.scratch("made.msh")
+        self.assertEqual(called("--convert", curved, "--output", made)[0], 0)
+        self.assertEqual(called("--check", made)[0], 0)
         for path, told in (("none.msh", "there is no file none.msh"), (os.path.join(pulmo.SOURCE, "LICENSE"), "is no mesh that")):
             code, out, err = called("--check", path)
             self.assertEqual(code, 1)

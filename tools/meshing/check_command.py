@@ -8,10 +8,10 @@ from .report import bodies, measures, print_report, regions
 from .surfaces import patches
 
 
-def check(paths, names):
+def check(paths, names, mended):
     """Prints what a mesh's files hold and how good it is; returns the Mesh, the checks that it fails, and the notes.
 
-    names: --names or None.
+    names: --names or None. mended: whether the Mesh will be written, without what pulmo refuses of the files.
     """
     raw = read_raw(paths)
     if names:
@@ -35,6 +35,10 @@ def check(paths, names):
         if name not in present:
             raw.notes.append(f"no surface is called {name}" + (f"; there are {', '.join(sorted(present))}" if present else "") + ". pulmo's "
                              f"scenes mean it by that name: rename it, or name yours in the options -..._surfaces.")
+    if mended:
+        raw.notes += [fault + "." for fault in raw.refused]
+    else:
+        failures += raw.refused
     for note in raw.notes:
         print("note: " + note)
     return mesh, failures, raw.notes

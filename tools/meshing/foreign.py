@@ -15,7 +15,10 @@ TRIANGLES = {2: 3, 9: 6, 21: 10}
 
 @dataclass
 class Raw:
-    """What a file holds: points, tetrahedra and triangles with the group of each (0: none), {(dimension, group): name}, notes."""
+    """What a file holds: points, tetrahedra and triangles with the group of each (0: none), {(dimension, group): name}.
+
+    notes: what else there is to tell. refused: what pulmo would refuse of the file, though not of the Mesh made of it.
+    """
 
     points: np.ndarray
     tets: np.ndarray
@@ -24,6 +27,7 @@ class Raw:
     groups: np.ndarray
     names: dict
     notes: list = field(default_factory=list)
+    refused: list = field(default_factory=list)
 
 
 def read_msh(path):
@@ -34,25 +38,30 @@ def read_msh(path):
             points, row = gmsh_nodes()
         except Exception as error:  # gmsh raises bare Exceptions
             raise MeshError(f"{path} is no mesh that gmsh reads ({error}).") from error
-        names, notes, parts = {}, [], {2: [], 3: []}
+        names, notes, refused, parts = {}, [], [], {2: [], 3: []}
         for dimension, tag in gmsh.model.getPhysicalGroups():
             names[dimension, tag] = gmsh.model.getPhysicalName(dimension, tag) or str(tag)
         for dimension, kinds in ((2, TRIANGLES), (3, TETS)):
             for _, entity in gmsh.model.getEntities(dimension):
                 group = gmsh.model.getPhysicalGroupsForEntity(dimension, entity)
                 if len(group) > 1:
-                    notes.append(f"some {'cells' if dimension == 3 else 'faces'} are in {len(group)} groups ("
-                                 + ", ".join(names[dimension, g] for g in group) + "): counted with the first.")
+                    said = f"are in {len(group)} groups (" + ", ".join(names[dimension, g] for g in group) + "), here counted with the first"
+                    if dimension == 3:
+                        notes.append(f"some cells {said}.")
+                    else:
+                        refused.append(f"some faces {said}; pulmo needs -mesh_prefer")
                 for kind, _, nodes in zip(*gmsh.model.mesh.getElements(dimension, entity)):
                     if kind not in kinds:
                         notes.append(f"elements that are no {'tetrahedra' if dimension == 3 else 'triangles'} are there (gmsh's type {kind}): "
                                      "left out.")
                         continue
                     if kinds[kind] != dimension + 1:
-                        notes.append("the edges are curved (elements of higher order): the corners only count.")
+                        refused.append("elements are of higher order, here counted with their corners only; gmsh -order 1 saves straight ones")
                     cells = row[nodes.astype(int)].reshape(-1, kinds[kind])[:, :dimension + 1]
                     parts[dimension].append((cells, np.full(len(cells), group[0] if len(group) else 0)))
-    return joined(points, parts, names, list(dict.fromkeys(notes)))
+    raw = joined(points, parts, names, list(dict.fromkeys(notes)))
+    raw.refused = list(dict.fromkeys(refused))
+    return raw
 
 
 def joined(points, parts, names, notes):
@@ -71,7 +80,7 @@ def mesh_of(raw):
         raw.notes.append(f"{np.sum(volumes < 0)} of {len(volumes)} tetrahedra are left-handed; turned (pulmo turns them, too).")
     used, tets = np.unique(raw.tets, return_inverse=True)
     points, tets = raw.points[used], orient(raw.points[used], tets.reshape(-1, 4))
-    if len(used) < len(raw.points):
+    if len(used) < len(raw.points) and not raw.refused:
         raw.notes.append(f"{len(raw.points) - len(used)} nodes belong to no tetrahedron; left out.")
     faces = np.sort(tets[:, FACES].reshape(-1, 3), axis=1)
     _, count = np.unique(faces, axis=0, return_counts=True)
@@ -84,7 +93,7 @@ def mesh_of(raw):
     for name, number in inner.items():
         raw.notes.append(f"{number} faces of {raw.names.get((2, name), name)} lie within the volume; pulmo lets no effect use such a name.")
     if strange:
-        raw.notes.append(f"{strange} triangles are no faces of cells; pulmo refuses them.")
+        raw.refused.append(f"{strange} triangles are no faces of cells")
     names = {key: name for key, name in raw.names.items()
              if (key[1] == surfaces).any() and key[0] == 2 or (key[1] == raw.regions).any() and key[0] == 3}
     apart = torn(points, facets)

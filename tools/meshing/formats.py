@@ -1,5 +1,6 @@
 """Reads meshes of other programs: MSH, DOLFIN's HDF5, Exodus, and what meshio reads (VTU, XDMF, ...)."""
 import contextlib
+import io
 import os
 
 import numpy as np
@@ -52,10 +53,11 @@ def read_meshio(path):
     import meshio
 
     try:
-        with contextlib.redirect_stdout(None):
+        with contextlib.redirect_stdout(None), contextlib.redirect_stderr(io.StringIO()) as said:
             read = meshio.read(path)
-    except (Exception, SystemExit) as error:  # each format of meshio's raises kinds of its own
-        raise MeshError(f"{path} is no mesh that meshio reads ({str(error) or type(error).__name__}).") from error
+    except (Exception, SystemExit) as error:  # each format of meshio's raises kinds of its own, and some end the program
+        why = " ".join((said.getvalue() if isinstance(error, SystemExit) else str(error)).split()).rstrip(".")
+        raise MeshError(f"{path} is no mesh that meshio reads ({why or type(error).__name__}).") from error
     whole = {name: data for name, data in read.cell_data.items() if all(is_whole(values) for values in data)}
     chosen = next((name for name in TAGS if name in whole), next(iter(whole)) if len(whole) == 1 else None)
     notes = []
@@ -94,7 +96,8 @@ def read_dolfin(path):
             functions = {name: (group["topology"][()].astype(int), group["values"][()].ravel().astype(int))
                          for name, group in groups.items() if "values" in group and group["topology"].shape[1] in (3, 4)}
     except (OSError, StopIteration, KeyError, AttributeError, IndexError, ValueError) as error:
-        raise MeshError(f"{path} is no HDF5 file of DOLFIN with a mesh of tetrahedra ({str(error) or 'no group with coordinates and topology'}).") from error
+        why = str(error) or "no group with coordinates and topology"
+        raise MeshError(f"{path} is no HDF5 file of DOLFIN with a mesh of tetrahedra ({why}).") from error
     parts, names = {2: [], 3: [(tets, np.zeros(len(tets), int))]}, {}
     raw = joined(points, parts, names, [])
     for name, (cells, values) in functions.items():
@@ -138,6 +141,7 @@ def add_groups(whole, raw, path):
         whole.names |= {(dimension, tag + shift): name for (d, tag), name in raw.names.items() if d == dimension}
         attach(whole, dimension, node[cells], np.where(groups != 0, groups + shift, 0))
     whole.notes += raw.notes
+    whole.refused += raw.refused
 
 
 def read_exodus(path):
@@ -148,7 +152,9 @@ def read_exodus(path):
     vtk.vtkObject.GlobalWarningDisplayOff()
     reader = vtk.vtkExodusIIReader()
     reader.SetFileName(path)
-    if not reader.CanReadFile(path):
+    with open(path, "rb") as file:
+        netcdf = file.read(4)[:3] in (b"CDF", b"\x89HD")
+    if not netcdf or not reader.CanReadFile(path):
         raise MeshError(f"{path} is no Exodus file that can be read.")
     reader.UpdateInformation()
     for kind in (reader.ELEM_BLOCK, reader.SIDE_SET):

@@ -217,7 +217,7 @@ def made(given):
 def checked(given):
     """Checks a mesh of another program, and converts it if that is asked for; returns the exit code."""
     files = given.check or given.convert
-    mesh, failures, notes = check(files, given.names)
+    mesh, failures, notes = check(files, given.names, bool(given.convert))
     show(given, mesh, os.path.basename(files[0]), failures, notes)
     if given.convert:
         write_mesh(with_whole_volume(mesh), given.output, float(given.format), given.binary, digits=16)
