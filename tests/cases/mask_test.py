@@ -99,7 +99,7 @@ def ellipsoid(middle, fineness=24):
     points, triangles = octants(*octant_directions(fineness))
     a, b, c = np.moveaxis(points[triangles], 1, 0)
     inwards = np.sum(a * np.cross(b, c), axis=1) < 0
-    return points * HALF + middle, np.where(inwards[:, None], triangles[:, ::-1], triangles)
+    return points * HALF + middle, np.where(inwards[:, None], triangles[:, ::-1], triangles).astype(np.int32)
 
 
 def write_exodus(path, mesh):
