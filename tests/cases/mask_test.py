@@ -21,7 +21,8 @@ sys.path.insert(0, os.path.join(pulmo.SOURCE, "tools"))
 from meshing import lung_command  # noqa: E402
 from meshing.geometry import boundary_facets, facet_areas, tet_volumes  # noqa: E402
 from meshing.gmsh_model import gmsh_session  # noqa: E402
-from meshing.labels import part_of  # noqa: E402
+from meshing.label_image import Label  # noqa: E402
+from meshing.labels import find_parts, part_of  # noqa: E402
 from meshing.msh import read_mesh  # noqa: E402
 from meshing.quality import dihedral_angles, sicn  # noqa: E402
 from meshing.sphere import mirrored as octants, octant_directions  # noqa: E402
@@ -454,6 +455,16 @@ class Masks(unittest.TestCase):
         """{name: volume or area} of a Mesh."""
         return {name: tet_volumes(mesh.points, mesh.tets[mesh.regions == tag]).sum() if dimension == 3
                 else facet_areas(mesh.points, mesh.facets[mesh.surfaces == tag]).sum() for (dimension, tag), name in mesh.names.items()}
+
+    def test_names_and_numbers_together(self):
+        """A name for the airway only: the lungs are known by their numbers, or there is one label beside it."""
+        def parts(labels, names):
+            told = []
+            return find_parts({n: Label(v, np.array([x, 0, 0])) for n, (v, x) in labels.items()}, names, None, told.append), told[0]
+        self.assertEqual(parts({1: (800, 60), 2: (700, -60), 7: (20, 0)}, {7: "trachea"})[0], {"right": [1], "left": [2], "airway": [7]})
+        found, told = parts({1: (1500, 0), 7: (20, 0)}, {7: "trachea"})
+        self.assertEqual(found, {"lungs": [1], "airway": [7]})
+        self.assertIn("only one label beside the airway's", told)
 
     def test_what_names_mean(self):
         for name, part in (("lung_upper_lobe_left", "left_upper"), ("Right Middle Lobe", "right_middle"), ("RLL", "right_lower"),

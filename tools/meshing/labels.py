@@ -122,13 +122,17 @@ def find_parts(present, names, asked, say):
     """
     if asked:
         return checked(from_option(asked, present, names))
-    parts, how = from_names(names, present, say), "labels by the names that come with the file"
-    if not any(part != "airway" for part in parts):
+    named = from_names(names, present, say)
+    parts, how = named, "labels by the names that come with the file"
+    others = [number for number in present if number not in named.get("airway", [])]
+    if set(named) <= {"airway"}:
         parts, program = from_numbers(present)
         how = f"labels as {program}"
-    if not parts and len(present) == 1:
-        parts, how = {"lungs": list(present)}, "there is only one label"
-    if not parts:
+    if not parts and len(others) == 1:
+        parts, how = {"lungs": others}, "there is only one label" + (" beside the airway's" if named else "")
+    if parts:
+        parts |= named
+    else:
         raise MeshError(f"it cannot be told which labels are the lungs; there are {listed(present)}: say it, as in {EXAMPLE}.")
     say(how + ": " + ", ".join(f"{part}={'+'.join(map(str, numbers))}" for part, numbers in parts.items()) + ".")
     used = sum(parts.values(), [])
