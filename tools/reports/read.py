@@ -10,8 +10,8 @@ def fail(message):
     sys.exit(f"report: error: {message}")
 
 
-def read_signals(directory):
-    """Columns of signals.csv, or of signals.csv.part: name -> list (numbers, but text for the phase)."""
+def signals_path(directory):
+    """signals.csv, or signals.csv.part of a run that is at work, was stopped or failed."""
     path = os.path.join(directory, "signals.csv")
     if not os.path.isdir(directory):
         fail(f"there is no directory {directory}; name the -output_dir of a run")
@@ -19,11 +19,14 @@ def read_signals(directory):
         path += ".part"
     if not os.path.exists(path):
         fail(f"neither signals.csv nor signals.csv.part is in {directory}; this is no directory of a run")
+    return path
+
+
+def numbers_of(path):
+    """Columns of a table of signals: name -> list (numbers, but text for the phase)."""
     rows = whole_rows(path)
     if not rows or "time_s" not in rows[0] or "volume_ml" not in rows[0]:
         fail(f"{path} holds no steps of pulmo")
-    if len(rows) < 2:
-        fail(f"{path} holds the start of a run and no step yet")
     try:
         return {name: [row[name] if name == "phase" else float(row[name]) for row in rows] for name in rows[0]}
     except (TypeError, ValueError):

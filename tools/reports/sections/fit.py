@@ -1,0 +1,50 @@
+"""The single compartment P = PEEP + E (V - V0) + R Q that fits the last breath best, and what it leaves over in time."""
+from ..charts import chart, jumps, number, series, shades, thinned
+from ..run import Missing
+
+NAME, TITLE = "fit", "Fit of one compartment"
+
+
+def start_row(run, start):
+    """The last row at or before the start of a breath."""
+    return max(i for i, t in enumerate(run.time) if t <= start + 1e-9 * max(1, abs(start)))
+
+
+def build(run):
+    compliance, resistance = (run.summary.get(key) for key in ("compliance_ml_per_cmH2O", "resistance_cmH2O_s_per_l"))
+    if not run.breath or compliance is None or resistance is None:
+        raise Missing("The run defines no compliance and resistance: it needs a complete breath with flow.")
+    column = "ventilator_pressure_cmH2O" if "ventilator_pressure_cmH2O" in run.signals else "airway_pressure_cmH2O"
+    pressure = run.signals[column]
+    volume, flow = run.signals["volume_ml"], run.signals["flow_ml_per_s"]
+    first = run.summary["breaths"][0]
+    rest = volume[start_row(run, first["start_s"])]
+    begin, end = start_row(run, run.breath["start_s"]), start_row(run, run.breath["end_s"])
+    rows = [begin + 1 + i for i in thinned(end - begin)]
+    time = [run.time[i] for i in rows]
+    measured = [pressure[i] for i in rows]
+    fitted = [first["peep_cmH2O"] + (volume[i] - rest) / compliance + resistance * flow[i] / 1000 for i in rows]
+    left = [a - b for a, b in zip(measured, fitted)]
+    weights = [run.time[i] - run.time[i - 1] for i in rows]
+    rms = (sum(w * r * r for w, r in zip(weights, left)) / sum(weights)) ** 0.5
+    broken = [k for k, i in enumerate(rows) if k and i in jumps(run, column)]
+
+    def gaps(values, own=False):
+        """With a row before each jump that is not drawn: its time is that of the next one."""
+        out = list(values)
+        for k in reversed(broken):
+            out.insert(k, out[k] if own else None)
+        return out
+    spans = [s for s in shades(run) if s[2] > run.time[begin] and s[1] < run.time[end]]
+    worst = max(range(len(left)), key=lambda i: abs(left[i]))
+    name = run.name
+    return {"charts": [
+        chart(f"fit-{run.id}", f"Pressure and fit, breath {run.summary['numbers_of_breath']}", "time", "pressure",
+              [series("airway pressure", gaps(time, own=True), gaps(measured), 0, marks=len(rows) <= 400),
+               series("fit", gaps(time, own=True), gaps(fitted), 1)],
+              f"pressure of {name} and of the single compartment", x_unit="s", y_unit="cmH₂O", shades=spans, hover="x", legend=True),
+        chart(f"residual-{run.id}", "Pressure minus fit", "time", "residual", [series("residual", gaps(time, own=True), gaps(left), 0, marks=len(rows) <= 400)],
+              f"residual of the fit, {number(rms, 3)} cmH₂O in the mean square", x_unit="s", y_unit="cmH₂O", shades=spans, hover="x")],
+        "compliance": number(compliance), "resistance": number(resistance), "constant": number(compliance * resistance / 1000),
+        "peep": number(first["peep_cmH2O"]), "rms": number(rms, 3), "worst": number(left[worst], 3), "when": number(time[worst]),
+        "share": number(100 * rms / max(max(measured) - min(measured), 1e-12), 2)}
