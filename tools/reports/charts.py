@@ -5,6 +5,7 @@ COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#8a6d00", "#0
 DASHES = [[], [6, 3], [2, 2], [8, 3, 2, 3]]
 SHADES = {"settle": "#eeeeee", "inspiration": "#dbe9f6", "expiration": "#fdf0e3", "pause": "#e8e1f2", "hold": "#e8e1f2",
           "inflation": "#dbe9f6", "deflation": "#fdf0e3"}
+OTHER_SHADES = ["#e3f1e6", "#f3ecd2", "#dff0f2", "#f4e1ea"]  # of phases with names of their own
 ROWS_OF_A_TABLE = 120
 POINTS_OF_A_CURVE = 3000
 
@@ -66,7 +67,9 @@ def table(x, y, x_unit, y_unit, curves):
 def shades(run):
     """[(phase, begin, end, colour)] of a run's phases."""
     spans = phase_spans(run.signals) if "phase" in run.signals else []
-    return [[name, short(begin), short(end), SHADES.get(name, "#f4f4f4")] for name, begin, end in spans]
+    others = [name for name in dict.fromkeys(span[0] for span in spans) if name not in SHADES]
+    colour = SHADES | {name: OTHER_SHADES[i % len(OTHER_SHADES)] for i, name in enumerate(others)}
+    return [[name, short(begin), short(end), colour[name]] for name, begin, end in spans]
 
 
 def jumps(run, column):

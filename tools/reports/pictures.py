@@ -53,14 +53,14 @@ def lung(run):
         axes.add_collection3d(Poly3DCollection(corners, facecolors=faces, edgecolors=faces, linewidths=0.2))
         for set_limit, m in zip((axes.set_xlim, axes.set_ylim, axes.set_zlim), middle):
             set_limit(m - half, m + half)
-        axes.set_box_aspect((1, 1, 1), zoom=1.6)
+        axes.set_box_aspect((1, 1, 1), zoom=1.35)
         axes.view_init(elev=12, azim=azimuth)
         axes.set_axis_off()
-        axes.set_title(title, fontsize=10, y=0.02)
+        figure.text(0.25 + 0.5 * place, 0.01, title, ha="center", fontsize=10)
     if len(present) > 1:
         handles = [plt.Line2D([], [], marker="s", ls="", color=colour[n], label=names.get(n, f"region {n}")) for n in present]
         figure.legend(handles=handles, loc="upper center", ncols=min(len(handles), 5), frameon=False, fontsize=9)
-    figure.subplots_adjust(0, 0, 1, 0.95, 0, 0)
+    figure.subplots_adjust(0, 0.05, 1, 0.95, 0, 0)
     parts = ", ".join(names.get(n, f"region {n}") for n in present)
     return png(figure), f"The surface of the mesh at rest from the front and from the right: {parts}."
 
@@ -98,7 +98,7 @@ def sections(run, quantity):
             if number == len(shapes) - 1:
                 axes.set_xlabel(AXES[across], fontsize=8)
             axes.set_ylabel(AXES[up], fontsize=8)
-        row[0].set_ylabel("\n".join(textwrap.wrap(f"{what}, t = {fields.times[snapshot]:g} s", 24)) + f"\n\n{AXES[PLANES[0][2][1]]}", fontsize=8)
+        row[0].set_ylabel("\n".join(textwrap.wrap(what, 24)) + f"\nt = {fields.times[snapshot]:g} s\n\n{AXES[PLANES[0][2][1]]}", fontsize=8)
     bar = figure.colorbar(drawn, ax=grid, shrink=0.8, aspect=30, pad=0.02)
     bar.set_label(quantity.label, fontsize=9)
     bar.ax.tick_params(labelsize=8)
@@ -116,10 +116,10 @@ def widest(fields, axis, centre):
     return float(inside[1][np.argmax(np.convolve(inside[0], np.ones(5), "same"))] + np.diff(inside[1])[0] / 2)
 
 
-def eit(image, shares, centre):
-    """The image of a belt, seen from the feet as clinicians do; centre of ventilation as a cross."""
+def eit(image, counted, centre):
+    """The image of a belt, the pixels that count, seen from the feet as clinicians do; centre of ventilation as a cross."""
     figure, axes = plt.subplots(figsize=(4.6, 3.9), layout="constrained")
-    drawn = axes.imshow(np.ma.masked_where(shares <= 0, image), cmap="viridis", interpolation="nearest", vmin=min(0, image.min()))
+    drawn = axes.imshow(np.ma.masked_where(~counted, image), cmap="viridis", interpolation="nearest", vmin=min(0, image[counted].min()))
     axes.plot(*centre, marker="+", color="white", ms=13, mew=4)
     axes.plot(*centre, marker="+", color="black", ms=12, mew=1.6)
     axes.set_xticks([0, 31], ["right", "left"])

@@ -1,6 +1,7 @@
 """One run as the page needs it: what its directory holds, read once, finished or not."""
 import functools
 import os
+import re
 
 from shared.signals import whole_rows
 
@@ -27,6 +28,11 @@ class Run:
     def moving(self):
         """Whether there is a step to draw."""
         return len(self.time) > 1
+
+    @property
+    def failure(self):
+        """Why the run failed, without the list of all that was tried."""
+        return re.sub(r" Tried .*?\. (?=Where: )", " ", self.summary.get("failure") or "It gave no reason.", flags=re.DOTALL)
 
     @functools.cached_property
     def energy(self):

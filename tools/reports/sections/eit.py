@@ -7,7 +7,7 @@ from ..charts import number
 from ..cuts import cut
 from ..run import Missing
 
-NAME, TITLE = "eit", "As electrical impedance tomography would show it"
+NAME, TITLE = "eit", "Image as in EIT"
 PIXELS, FINE, PLANES = 32, 8, 9  # fine pixels across a pixel; planes within the belt
 BELT = 0.25  # of the height of the lung
 INSIDE = 0.5  # share of a pixel that must be lung to count
@@ -58,7 +58,7 @@ def build(run):
     def along(place, taken):
         """From 0 to 100 % of the lung's extent in the image."""
         return 100 * (place - taken.min() + 0.5) / (taken.max() - taken.min() + 1)
-    return {"image": pictures.eit(image, shares, (column, row)), "index": number(index, 3), "thickness": number(thickness, 3),
+    return {"image": pictures.eit(image, shares >= INSIDE, (column, row)), "index": number(index, 3), "thickness": number(thickness, 3),
             "back": number(along(row, rows), 3), "left": number(along(column, columns), 3), "pixels": int((shares >= INSIDE).sum()),
             "air": number(float(image.sum())), "between": " to ".join(run.moment(s) for s in run.full),
             "quarters": quarters(image)}

@@ -43,7 +43,7 @@ def build(run):
         last = [(key, values[-1]) for key, values in table.items() if key in keys and values[-1]]
         gone = [(key, value) for key, value in last if key not in GIVEN]
         if gone:
-            charts.append(chart(f"energy-went-{run.id}", "Where the work went, whole run", "energy", "", [
+            charts.append(chart(f"energy-went-{run.id}", "Where the work went, whole run", "energy", "what took it", [
                 {"label": "energy", "x": [float(f"{value:.6g}") for _, value in gone], "y": [words(key) for key, _ in gone],
                  "colour": COLOURS[0], "dash": []}], "energy by what it went into at the end of the run", x_unit="J", kind="bar",
                 height=3 + 1.9 * len(gone)))

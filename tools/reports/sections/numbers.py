@@ -54,12 +54,15 @@ def value(run, key):
 
 
 def difference(first, other):
-    """Of a number from that of the first run, in its unit and in percent."""
+    """Of a number from that of the first run, in its unit and, up to ten times as much, in percent."""
     if first is None or other is None:
         return ""
     change = other - first
-    share = f" ({100 * change / abs(first):+.1f} %)" if first else ""
-    return f"{'+' if change > 0 else '−' if change < 0 else '±'}{number(abs(change), 3)}{share}"
+    if not change:
+        return "0"
+    sign = "+" if change > 0 else "−"
+    share = f" ({sign}{100 * abs(change / first):.1f} %)" if abs(change) < 10 * abs(first) else ""
+    return f"{sign}{number(abs(change), 3)}{share}"
 
 
 def compare(runs):

@@ -18,7 +18,7 @@
   };
 
   const axis = (name, unit, more) => ({
-    type: 'linear', title: {display: Boolean(name), text: withUnit(name, unit)}, ticks: {maxRotation: 0, autoSkipPadding: 12},
+    type: 'linear', title: {display: Boolean(name), text: withUnit(name, unit)}, ticks: {maxRotation: 0, autoSkipPadding: 12, includeBounds: false},
     grid: {color: (line) => (line.tick && line.tick.value === 0 ? '#777777' : '#dddddd')}, ...more,
   });
 
@@ -49,7 +49,7 @@
           x: axis(data.x, data.xUnit, {min: data.shades && data.shades.length ? Math.min(...curves.map((c) => c.x[0])) : undefined,
                                        max: data.shades && data.shades.length ? Math.max(...curves.map((c) => c.x[c.x.length - 1])) : undefined,
                                        beginAtZero: Boolean(data.from_zero)}),
-          y: axis(data.y, data.yUnit, data.shades ? {afterFit: (scale) => { scale.width = 68; }} : {}), // one time axis below another
+          y: axis(data.y, data.yUnit, data.shades ? {afterFit: (scale) => { scale.width = Math.max(scale.width, 72); }} : {}), // one time axis below another
         },
         plugins: {
           legend: {display: several || Boolean(data.legend), labels: {usePointStyle: true, pointStyle: 'line'}},
