@@ -1,5 +1,5 @@
 #!/usr/bin/python3
-"""The tools beside the program: mesh generator, report, benchmarks."""
+"""The tools beside the program: mesh generator, benchmarks."""
 import contextlib
 import csv
 import io
@@ -22,7 +22,6 @@ import failed_tests  # noqa: E402
 from benchmarks import assembly, effects, memory, operations, scaling  # noqa: E402
 from hardcases import gallery, page  # noqa: E402
 from meshing import lung_command, sphere_command  # noqa: E402
-from reports import pv_curve  # noqa: E402
 from shared import common, keys  # noqa: E402
 
 
@@ -174,49 +173,6 @@ class Tools(unittest.TestCase):
                 self.assertIn(told, refused.stderr)
                 self.assertEqual(len(refused.stderr.splitlines()), 1, refused.stderr)
                 self.assertEqual(os.listdir(folder), [])
-
-    def test_report_draws(self):
-        case = pulmo.finished(pulmo.DIRECT + pulmo.PCV + pulmo.CUBE + ["-ts_max_time", "0.1"])
-        drawn = tool("report", case.directory)
-        self.assertEqual(drawn.returncode, 0, drawn.stderr)
-        with open(case.path("waveforms.png"), "rb") as f:
-            self.assertEqual(f.read(8), b"\x89PNG\r\n\x1a\n")
-        drawn = tool("report", pulmo.scratch())
-        self.assertNotEqual(drawn.returncode, 0)
-        self.assertNotIn("Traceback", drawn.stderr)
-
-    def test_report_finds_where_a_static_curve_bends(self):
-        pressure = np.linspace(0, 40, 15)
-
-        def said(volume, P=pressure):
-            return pv_curve.describe({"static_curve": [{"pressure_cmH2O": p, "volume_ml": v} for p, v in zip(P, volume)]})
-
-        c, d, b = 18.0, 5.0, 2000.0
-        whole = pv_curve.sigmoid(pressure, 100, b, c, d)
-        back = np.append(whole, np.minimum(whole[-2::-1] + 50, whole[-1] - 1))  # and a deflation limb, which does not count
-        for lines in said(whole), said(back, np.append(pressure, pressure[-2::-1])):
-            self.assertEqual(lines, ["static curve: largest compliance 100 ml/cmH2O at 18.0 cmH2O", "lower inflection point 8.0 cmH2O",
-                                     "upper inflection point 28.0 cmH2O"])
-        self.assertIn("no upper inflection point between 0.0 and 20.0 cmH2O", said(whole[:8], pressure[:8]))
-        self.assertIn("take these numbers with care", " ".join(said(whole + 100 * np.cos(pressure))))
-        self.assertEqual(said(whole[:5], pressure[:5]), [])
-        self.assertEqual(said(np.zeros(15)), [])
-        self.assertEqual(pv_curve.describe({}), [])
-
-    def test_report_draws_what_a_run_that_failed_or_is_at_work_left(self):
-        failed = pulmo.Case(pulmo.DIRECT + pulmo.CUBE + ["-airflow", "-chest_wall", "-snes_max_it", "1", "-ts_dt", "0.1"] +
-                            pulmo.programme("rest 0.2 pressure 0\npush 0.2 pressure 5\n"))
-        self.assertEqual(failed.code, 2, failed.tail())
-        drawn = tool("report", failed.directory)
-        self.assertEqual(drawn.returncode, 0, drawn.stderr)
-        self.assertIn("report: FAILED: steps only crawl", drawn.stdout)
-        self.assertIn("waveforms.png", failed.files())
-        os.remove(failed.path("failure.json"))
-        with open(failed.path("signals.csv.part"), "a") as f:
-            f.write("0.3,1.5")  # a row at the moment of its writing
-        drawn = tool("report", failed.directory)
-        self.assertEqual(drawn.returncode, 0, drawn.stderr)
-        self.assertIn("report: NOT FINISHED: at work, stopped or killed; rows up to 0.2", drawn.stdout)
 
     def test_ranges_of_laws_are_those_of_the_page(self):
         run = subprocess.run([os.path.join(pulmo.SOURCE, "tools/law_ranges"), "--check", "--build", os.path.dirname(pulmo.PROGRAM)],

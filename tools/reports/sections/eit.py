@@ -8,7 +8,7 @@ from ..cuts import cut
 from ..run import Missing
 
 NAME, TITLE = "eit", "Image as in EIT"
-PIXELS, FINE, PLANES = 32, 8, 9  # fine pixels across a pixel; planes within the belt
+PIXELS, FINE, PLANES = 32, 16, 9  # fine pixels across a pixel; planes within the belt
 BELT = 0.25  # of the height of the lung
 INSIDE = 0.5  # share of a pixel that must be lung to count
 
