@@ -10,6 +10,7 @@ import subprocess
 import sys
 import types
 import unittest
+from unittest import mock
 
 import numpy as np
 from PIL import Image
@@ -17,7 +18,7 @@ from PIL import Image
 import pulmo_case as pulmo
 
 sys.path.insert(0, os.path.join(pulmo.SOURCE, "tools"))
-from reports import charts, cuts, options, page, pv_curve, run as of_run, sections  # noqa: E402
+from reports import charts, cuts, options, page, pictures, pv_curve, run as of_run, sections  # noqa: E402
 
 COARSE = ["-elements", "P1-P1", "-ts_dt", "0.1"]
 WEIGHT = ["-gravity", "-gravity_direction", "0,-1,0", "-tissue_porosity", "0.75"]
@@ -27,7 +28,15 @@ VOID = {"meta", "link", "img", "br", "input", "path"}
 
 def tool(*arguments):
     return subprocess.run([os.path.join(pulmo.SOURCE, "tools/report"), *map(str, arguments)], env=pulmo.ENVIRONMENT,
-                          capture_output=True, text=True, timeout=120)
+                          capture_output=True, text=True, timeout=300)
+
+
+def written(*directories):
+    """The page of some runs without the time that pictures take."""
+    dot = "data:image/png;base64,AAAA", "a dot in the place of a picture", 0, 1
+    with mock.patch.object(pictures, "lung", lambda run: dot), mock.patch.object(pictures, "eit", lambda *_: dot[0]), \
+            mock.patch.object(pictures, "sections", lambda run, quantity: dot if run.fields.shape(0) is not None else None):
+        return page.page(of_run.load(directories))
 
 
 class Page(html.parser.HTMLParser):
@@ -89,7 +98,7 @@ class Runs(unittest.TestCase):
         assert cls.failed.code == 2, cls.failed.tail()
         cls.text = page.page(of_run.load([cls.case.directory]))
         cls.page = Page(cls.text)
-        cls.pair = page.page(of_run.load([cls.case.directory, cls.other.directory]))
+        cls.pair = written(cls.case.directory, cls.other.directory)
 
     def copy(self, case, name="copy"):
         to = pulmo.scratch(name)
@@ -140,7 +149,7 @@ class Runs(unittest.TestCase):
         told = pulmo.finished(pulmo.DIRECT + pulmo.PCV + WEIGHT + pulmo.LUNG + COARSE +
                               ["-ventilator_pause", "0.2", "-tube", "-tube_k1", "4", "-scene_view_only"]).out
         told = told[told.index("In this scene\n") + 14:told.index("Not in this scene\n")].strip().splitlines()
-        words = lambda text: re.sub(r"\W+", " ", text.replace("₂", "2").replace("²", "2").replace("³", "3")).strip()  # noqa: E731
+        words = lambda text: re.sub(r"\W+", " ", text.replace("₂", "2").replace("²", "^2").replace("³", "^3")).strip()  # noqa: E731
         said = [(e["tag"], words(e["text"])) for e in self.page.elements if e["tag"] in ("dt", "dd") and "section" in e["within"]]
         lines = {name: what for (tag, name), (_, what) in zip(said[:-1], said[1:]) if tag == "dt"}
         self.assertGreaterEqual(len(told), 6)
@@ -172,7 +181,7 @@ class Runs(unittest.TestCase):
 
     def test_error_bars(self):
         summary = self.other.json()
-        shown = Page(page.page(of_run.load([self.other.directory])))
+        shown = Page(written(self.other.directory))
         rows = {row[0]: row for row in shown.table("clinical numbers")}
         for key in "tidal_volume_ml", "compliance_ml_per_cmH2O", "peak_inspiratory_pressure_cmH2O":
             row, bar = rows[sections.numbers.ROWS[key][0]], summary["error_estimate"]["numbers"][key]["error"]
@@ -224,7 +233,7 @@ class Runs(unittest.TestCase):
                     os.remove(os.path.join(directory, "failure.json"))
                     with open(os.path.join(directory, "signals.csv.part"), "a") as f:
                         f.write("0.3,1.5")  # a row at the moment of its writing
-                shown = Page(page.page(of_run.load([directory])))
+                shown = Page(written(directory))
                 body = shown.elements[next(i for i, e in enumerate(shown.elements) if e["tag"] == "h1") + 1]
                 self.assertIn(f"state {state}", body["class"])
                 self.assertIn(words, body["text"])
@@ -252,11 +261,11 @@ class Runs(unittest.TestCase):
             self.assertEqual(len(refused.stderr.splitlines()), 1, refused.stderr)
 
     def test_damaged_fields_cost_their_sections_only(self):
-        for what, how in (("fields.xdmf", lambda path: open(path, "w").write("<Xdmf><Domain>")), ("fields.h5", os.remove)):
+        for what, how in (("fields.xdmf", lambda path: os.truncate(path, 200)), ("fields.h5", os.remove)):
             with self.subTest(what=what):
                 directory = self.copy(self.case)
                 how(os.path.join(directory, what))
-                shown = Page(page.page(of_run.load([directory])))
+                shown = Page(written(directory))
                 self.assertIn(what, shown.section("slices")["text"])
                 self.assertIn("Tidal volume", shown.section("numbers")["text"])
 
@@ -274,7 +283,7 @@ class Runs(unittest.TestCase):
             text = f.read().replace("inspiration", EVIL.replace('"', "")).replace(",expiration", ",</script>")
         with open(os.path.join(directory, "signals.csv"), "w") as f:
             f.write(text)
-        text = page.page(of_run.load([directory]))
+        text = written(directory)
         self.assertNotIn("<img src=x", text)
         self.assertNotIn("<script>alert", text)
         shown = Page(text)
@@ -297,13 +306,13 @@ class Runs(unittest.TestCase):
         self.assertNotIn("http", policy)
 
     def test_a_page_too_large_goes_without_the_surface(self):
-        most, page.MOST = page.MOST, len(self.text.encode()) - 1
+        most, page.MOST = page.MOST, 700000
         try:
-            text = page.page(of_run.load([self.case.directory]))
+            text = written(self.case.directory)
         finally:
             page.MOST = most
         self.assertIn("Left out to keep the page small", Page(text).section("surface")["text"])
-        self.assertLess(len(text), len(self.text) - 800000)
+        self.assertLess(len(text), 600000)
 
     def test_for_all_readers(self):
         for text in self.text, self.pair:
@@ -384,7 +393,7 @@ class Browser(unittest.TestCase):
         run = subprocess.run(["chromium", "--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
                               f"--user-data-dir={directory}/profile", f"--window-size={width},{height}", "--hide-scrollbars",
                               "--virtual-time-budget=6000", "--enable-logging=stderr", f"--screenshot={picture}", "--dump-dom",
-                              f"file://{path}"], capture_output=True, text=True, timeout=120)
+                              f"file://{path}"], capture_output=True, text=True, timeout=300)
         title = re.search(r"<title>(.*?)</title>", run.stdout, re.DOTALL)
         self.assertTrue(title, run.stderr[-2000:])
         seen = json.loads(html.unescape(title[1]))

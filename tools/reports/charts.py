@@ -20,7 +20,7 @@ def number(value, digits=4):
     if 1e-3 <= size < 1e6:
         text = f"{value:.{digits}g}"
         return f"{value:.0f}" if "e" in text else text
-    return f"{value:.{digits - 1}g}"
+    return f"{value:.{digits}g}"
 
 
 def thinned(count, keep=()):

@@ -6,6 +6,8 @@ import xml.etree.ElementTree as ElementTree
 import h5py
 import numpy as np
 
+from .cuts import cut
+
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])  # of a tetrahedron, each seen from outside
 LATTICE = 4  # points of a cell along an edge, where a cell is shared out among bins
 
@@ -65,6 +67,11 @@ class Fields:
     def shape(self, snapshot):
         """Places of the corners, mm."""
         return self.points + self.values("displacement_mm", snapshot)
+
+    @functools.lru_cache(maxsize=32)
+    def section(self, snapshot, axis, place):
+        """(polygons, cells) of a section through the shape of a moment."""
+        return cut(self.shape(snapshot), self.cells, axis, place)
 
     def volume(self, snapshot):
         """Volume of the lung, mm^3."""

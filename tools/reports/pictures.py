@@ -12,7 +12,7 @@ from matplotlib.collections import PolyCollection  # noqa: E402
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # noqa: E402
 from PIL import Image  # noqa: E402
 
-from .cuts import cut, rarer  # noqa: E402
+from .cuts import rarer  # noqa: E402
 
 AXES = ["x (mm), right … left", "y (mm), to the front", "z (mm), upwards"]
 # name, axis of the normal, axes of the picture
@@ -75,31 +75,36 @@ def sections(run, quantity):
     box = np.array([np.min([x.min(0) for x in shapes.values()], 0), np.max([x.max(0) for x in shapes.values()], 0)])
     box += np.array([[-1], [1]]) * 0.03 * np.ptp(box, axis=0).max()
     through = [widest(fields, axis, centre) for _, axis, _ in PLANES]
-    widths = [np.ptp(box[:, across]) for _, _, (across, _) in PLANES]
-    height = max(np.ptp(box[:, up]) for _, _, (_, up) in PLANES)
-    inches = min(6.6 / sum(widths), 2.3 / height)  # a mm
-    figure, grid = plt.subplots(len(shapes), 3, figsize=(sum(widths) * inches + 2.6, len(shapes) * (height * inches + 0.25) + 0.5),
-                                squeeze=False, layout="constrained", width_ratios=widths)
-    for number, (row, (what, snapshot)) in enumerate(zip(grid, run.moments)):
-        for axes, (name, normal, (across, up)), place in zip(row, PLANES, through):
-            polygons, cells = cut(shapes[snapshot], fields.cells, normal, place)
+    sizes = [np.ptp(box[:, axes], axis=0) for _, _, axes in PLANES]
+    inches = min(6.6 / sum(width for width, _ in sizes), 2.3 / max(height for _, height in sizes))  # a mm
+    row_height, left, gap, bottom = max(height for _, height in sizes) * inches + 0.25, 1.0, 0.6, 0.45
+    total = left + sum(width for width, _ in sizes) * inches + 2 * gap + 1.0, bottom + len(shapes) * row_height + 0.15
+    figure = plt.figure(figsize=total)
+
+    def place_of(x, y, width, height):
+        return figure.add_axes((x / total[0], y / total[1], width / total[0], height / total[1]))
+    for number, (what, snapshot) in enumerate(run.moments):
+        last, x, y = number == len(shapes) - 1, left, bottom + (len(shapes) - 1 - number) * row_height
+        for (name, normal, (across, up)), place, (width, height) in zip(PLANES, through, sizes):
+            axes = place_of(x, y, width * inches, height * inches)
+            x += width * inches + gap
+            polygons, cells = fields.section(snapshot, normal, place)
             drawn = PolyCollection([p[:, (across, up)] for p in polygons], array=values[snapshot][cells], cmap=quantity.map,
                                    antialiaseds=False, linewidths=0)
             drawn.set_clim(low, high)
             axes.add_collection(drawn)
             axes.set_xlim(*box[:, across][::-1 if across == 0 else 1])  # the right of the body on the left, as in a CT
             axes.set_ylim(*box[:, up])
-            axes.set_aspect("equal")
-            axes.tick_params(labelsize=7, labelbottom=number == len(shapes) - 1)
-            for side in axes.spines.values():
-                side.set_color("#cccccc")
+            axes.tick_params(labelsize=7, labelbottom=last)
+            axes.spines[:].set_color("#cccccc")
             if number == 0:
                 axes.set_title(f"{name}, {'xyz'[normal]} = {place:.0f} mm", fontsize=9)
-            if number == len(shapes) - 1:
+            if last:
                 axes.set_xlabel(AXES[across], fontsize=8)
-            axes.set_ylabel(AXES[up], fontsize=8)
-        row[0].set_ylabel("\n".join(textwrap.wrap(what, 24)) + f"\nt = {fields.times[snapshot]:g} s\n\n{AXES[PLANES[0][2][1]]}", fontsize=8)
-    bar = figure.colorbar(drawn, ax=grid, shrink=0.8, aspect=30, pad=0.02)
+            axes.set_ylabel(AXES[up], fontsize=8, labelpad=1)
+        words = "\n".join(textwrap.wrap(what, 24)) + f"\nt = {fields.times[snapshot]:g} s"
+        figure.text(0.25 / total[0], (y + row_height / 2) / total[1], words, rotation=90, ha="center", va="center", fontsize=8)
+    bar = figure.colorbar(drawn, cax=place_of(x - gap + 0.2, bottom + 0.1 * total[1], 0.15, 0.75 * total[1]))
     bar.set_label(quantity.label, fontsize=9)
     bar.ax.tick_params(labelsize=8)
     said = "; ".join(f"{what}: mean {np.average(values[s], weights=fields.volumes):.4g}, from {values[s].min():.4g} to {values[s].max():.4g}"
