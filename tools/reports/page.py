@@ -43,6 +43,8 @@ def context(section, runs, without):
             given, why = section.compare(runs) if shared else section.build(run), ""
         except Missing as reason:
             given, why = None, str(reason)
+        except KeyError as key:
+            given, why = None, f"The files of the run have no {key}: another version of pulmo wrote them, or they are damaged."
         blocks.append({"run": run, "given": given, "why": why})
     return {"name": section.NAME, "title": section.TITLE, "blocks": blocks, "template": f"sections/{section.NAME}.html.j2"}
 

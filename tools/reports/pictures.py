@@ -37,7 +37,7 @@ def lung(run):
     triangles, cells = rarer(fields.points, *fields.surface, PICTURE_TRIANGLES)
     numbers = fields.values("region_number", 0)
     region = np.zeros(len(cells), int) if numbers is None else numbers[cells].astype(int)
-    names = {entry["number"]: name for name, entry in (run.summary.get("regions") or {}).items()}
+    names = {entry.get("number"): name for name, entry in (run.summary.get("regions") or {}).items()}
     corners = fields.points[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-30)[:, None]
