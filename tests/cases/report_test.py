@@ -1,10 +1,13 @@
 #!/usr/bin/python3
 """tools/report: the page of a run, of several, of one that failed or is at work, in a browser and without one."""
+import contextlib
 import csv
 import html.parser
+import io
 import json
 import os
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -29,6 +32,20 @@ VOID = {"meta", "link", "img", "br", "input", "path"}
 def tool(*arguments):
     return subprocess.run([os.path.join(pulmo.SOURCE, "tools/report"), *map(str, arguments)], env=pulmo.ENVIRONMENT,
                           capture_output=True, text=True, timeout=300)
+
+
+def called(*arguments):
+    """What tool() gives, without a new Python."""
+    out, err = io.StringIO(), io.StringIO()
+    path = os.path.join(pulmo.SOURCE, "tools/report")
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), mock.patch.object(sys, "argv", [path, *map(str, arguments)]):
+        try:
+            runpy.run_path(path, run_name="__main__")
+            code = 0
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else 1
+            err.write("" if isinstance(end.code, int) else f"{end.code}\n")
+    return subprocess.CompletedProcess([path, *arguments], code, out.getvalue(), err.getvalue())
 
 
 def written(*directories):
@@ -243,19 +260,19 @@ class Runs(unittest.TestCase):
 
     def test_command_line(self):
         directory = self.copy(self.failed)
-        made = tool(directory)
+        made = tool(directory)  # as a user calls it
         self.assertEqual(made.returncode, 0, made.stderr)
         self.assertIn("report: FAILED: steps only crawl", made.stdout)
         self.assertIn("report.html", os.listdir(directory))
         figure = os.path.join(directory, "figure.svg")
-        made = tool(directory, "--figure", figure)
+        made = called(directory, "--figure", figure)
         self.assertEqual(made.returncode, 0, made.stderr)
         with open(figure) as f:
             self.assertIn("<svg", f.read())
         for arguments, word in (([pulmo.scratch()], "no directory"), ([directory, "--output", "a.png"], "--figure"),
                                 ([directory, "--figure", "a.gif"], ".png"), ([directory, directory], "twice"),
                                 ([directory, "--output", "/no/such/folder/a.html"], "cannot write")):
-            refused = tool(*arguments)
+            refused = called(*arguments)
             self.assertEqual(refused.returncode, 1, arguments)
             self.assertIn(word, refused.stderr)
             self.assertEqual(len(refused.stderr.splitlines()), 1, refused.stderr)
