@@ -17,7 +17,7 @@ def build(run):
     columns = [key for key in COLUMNS if any(breath.get(key) is not None for breath in breaths)]
     trial = run.summary.get("peep_trial")
     return {"heads": [ROWS[key] for key in columns],
-            "rows": [{"number": i + 1, "span": f"{breath['start_s']:g} to {breath['end_s']:g}" if breath.get("end_s") is not None else f"{breath['start_s']:g} …",
+            "rows": [{"number": i + 1, "span": f"{number(breath['start_s'], 6)} to {number(breath['end_s'], 6)}",
                       "cut": not breath["complete"], "values": [number(breath.get(key), 5) for key in columns]}
                      for i, breath in enumerate(breaths)],
             "cut": any(not breath["complete"] for breath in breaths), "trial": trial and peep_trial(trial)}

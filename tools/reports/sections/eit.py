@@ -34,6 +34,7 @@ def belt(run):
         cell = np.asarray(which)
         lung += cell > 0
         air += np.where(cell > 0, came[np.maximum(cell, 1) - 1], 0)
+
     def coarse(values):
         return values.reshape(PIXELS, FINE, PIXELS, FINE).mean(axis=(1, 3)) / PLANES
     return coarse(air) * (side / PIXELS) ** 2 * thickness / 1000, coarse(lung), thickness

@@ -33,8 +33,7 @@ def build(run):
     if not parts:
         table = run.energy  # raises Missing
         parts = [("so far", {key: values[-1] for key, values in table.items() if key != "time_s"})]
-        parts[0][1].pop("time_s", None)
-    keys = [key for key in parts[0][1] if not key.startswith("residual") and key != "time_s"]
+    keys = [key for key in parts[0][1] if not key.startswith("residual")]
     rows = [{"words": words(key), "sign": "+" if key in GIVEN else "−", "values": [number(source.get(key), 5) for _, source in parts]}
             for key in keys]
     charts, why = [], ""
@@ -47,8 +46,8 @@ def build(run):
                 {"label": "energy", "x": [float(f"{value:.6g}") for _, value in gone], "y": [words(key) for key, _ in gone],
                  "colour": COLOURS[0], "dash": []}], "energy by what it went into at the end of the run", x_unit="J", kind="bar",
                 height=3 + 1.9 * len(gone)))
-        rows_drawn = thinned(len(table["time"]) if "time" in table else len(table["time_s"]))
-        time = table.get("time_s") or table["time"]
+        time = table["time_s"]
+        rows_drawn = thinned(len(time))
         drawn = [key for key in keys if key in table and any(table[key])]
         charts.append(chart(f"energy-time-{run.id}", "Sums since the start", "time", "energy", [
             series(words(key), [time[i] for i in rows_drawn], [table[key][i] for i in rows_drawn], i) for i, key in enumerate(drawn)],

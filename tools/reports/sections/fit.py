@@ -20,30 +20,28 @@ def build(run):
     first = run.summary["breaths"][0]
     rest = volume[start_row(run, first["start_s"])]
     begin, end = start_row(run, run.breath["start_s"]), start_row(run, run.breath["end_s"])
-    rows = [begin + 1 + i for i in thinned(end - begin)]
+    rows = range(begin + 1, end + 1)
     time = [run.time[i] for i in rows]
     measured = [pressure[i] for i in rows]
     fitted = [first["peep_cmH2O"] + (volume[i] - rest) / compliance + resistance * flow[i] / 1000 for i in rows]
     left = [a - b for a, b in zip(measured, fitted)]
     weights = [run.time[i] - run.time[i - 1] for i in rows]
     rms = (sum(w * r * r for w, r in zip(weights, left)) / sum(weights)) ** 0.5
-    broken = [k for k, i in enumerate(rows) if k and i in jumps(run, column)]
-
-    def gaps(values, own=False):
-        """With a row before each jump that is not drawn: its time is that of the next one."""
-        out = list(values)
-        for k in reversed(broken):
-            out.insert(k, out[k] if own else None)
-        return out
-    spans = [s for s in shades(run) if s[2] > run.time[begin] and s[1] < run.time[end]]
     worst = max(range(len(left)), key=lambda i: abs(left[i]))
-    name = run.name
+    broken = {i - rows[0] for i in jumps(run, column) if i > rows[0]}
+    drawn = thinned(len(rows), [j for k in broken if k < len(rows) for j in (k - 1, k)])
+
+    def curve(label, values, index, marks):
+        """Nothing is drawn over a jump."""
+        points = [point for k in drawn for point in ([(time[k], None)] if k in broken else []) + [(time[k], values[k])]]
+        return series(label, *zip(*points), index, marks=marks)
+    spans = [s for s in shades(run) if s[2] > run.time[begin] and s[1] < run.time[end]]
+    marks, name = len(rows) <= 400, run.name
     return {"charts": [
         chart(f"fit-{run.id}", f"Pressure and fit, breath {run.summary['numbers_of_breath']}", "time", "pressure",
-              [series("airway pressure", gaps(time, own=True), gaps(measured), 0, marks=len(rows) <= 400),
-               series("fit", gaps(time, own=True), gaps(fitted), 1)],
+              [curve("airway pressure", measured, 0, marks), curve("fit", fitted, 1, False)],
               f"pressure of {name} and of the single compartment", x_unit="s", y_unit="cmH₂O", shades=spans, hover="x", legend=True),
-        chart(f"residual-{run.id}", "Pressure minus fit", "time", "residual", [series("residual", gaps(time, own=True), gaps(left), 0, marks=len(rows) <= 400)],
+        chart(f"residual-{run.id}", "Pressure minus fit", "time", "residual", [curve("residual", left, 0, marks)],
               f"residual of the fit, {number(rms, 3)} cmH₂O in the mean square", x_unit="s", y_unit="cmH₂O", shades=spans, hover="x")],
         "compliance": number(compliance), "resistance": number(resistance), "constant": number(compliance * resistance / 1000),
         "peep": number(first["peep_cmH2O"]), "rms": number(rms, 3), "worst": number(left[worst], 3), "when": number(time[worst]),

@@ -11,12 +11,11 @@ PROFILES = [("apex to base", 2, "base", "apex"), ("dorsal to ventral", 1, "dorsa
 
 
 def by_region(run):
-    rows = [{"name": name, "volume": number(r["reference_volume_ml"]), "ventilation": number(r["ventilation_ml"]),
+    return [{"name": name, "volume": number(r["reference_volume_ml"]), "ventilation": number(r["ventilation_ml"]),
              "share": None if r["ventilation_share"] is None else 100 * r["ventilation_share"], "jacobian": number(r["jacobian_mean"]),
              "spread": number(r["jacobian_sd"], 3), "pressure": number(r["alveolar_pressure_mean_cmH2O"]),
              "pressure_spread": number(r["alveolar_pressure_sd_cmH2O"], 3)}
             for name, r in (run.summary.get("regions") or {}).items()]
-    return rows
 
 
 def by_gravity(run):
