@@ -278,7 +278,7 @@ class Runs(unittest.TestCase):
             self.assertEqual(len(refused.stderr.splitlines()), 1, refused.stderr)
 
     def test_damaged_fields_cost_their_sections_only(self):
-        for what, how in (("fields.xdmf", lambda path: os.truncate(path, 200)), ("fields.h5", os.remove)):
+        for what, how in (("fields.xdmf", lambda path: os.truncate(path, 200)), ("fields.h5", os.remove), ("fields_00000.h5", os.remove)):
             with self.subTest(what=what):
                 directory = self.copy(self.case)
                 how(os.path.join(directory, what))

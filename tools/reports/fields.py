@@ -7,13 +7,10 @@ import h5py
 import numpy as np
 
 from .cuts import cut
+from .read import Missing
 
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])  # of a tetrahedron, each seen from outside
 LATTICE = 4  # points of a cell along an edge, where a cell is shared out among bins
-
-
-class Unreadable(Exception):
-    """Why the fields cannot be read: one sentence."""
 
 
 class Fields:
@@ -23,7 +20,7 @@ class Fields:
         self.directory = directory
         path = os.path.join(directory, "fields.xdmf")
         if not os.path.exists(path):
-            raise Unreadable("The directory has no fields.xdmf, so there is no picture of the lung.")
+            raise Missing("The directory has no fields.xdmf, so there is no picture of the lung.")
         try:
             steps = ElementTree.parse(path).getroot().findall(".//Grid[@GridType='Uniform']")
             self.times = [float(step.find("Time").get("Value")) for step in steps]
@@ -32,7 +29,10 @@ class Fields:
             points = self._read(steps[0].find("Geometry/DataItem").text)
             cells = self._read(steps[0].find("Topology/DataItem").text)[:, :4]
         except (ElementTree.ParseError, AttributeError, IndexError, TypeError, ValueError) as error:
-            raise Unreadable(f"fields.xdmf is damaged or holds no snapshot yet ({error}).") from None
+            raise Missing(f"fields.xdmf is damaged or holds no snapshot yet ({error}).") from None
+        for name in "J_mean", "displacement_mm":
+            if any(name not in where for where in self._where):
+                raise Missing(f"fields.xdmf has no {name}: another version of pulmo wrote it.")
         self.corners, cells = np.unique(cells, return_inverse=True)  # mid-edge nodes go
         self.cells = cells.reshape(-1, 4)
         self.points = points[self.corners]
@@ -47,7 +47,7 @@ class Fields:
             with h5py.File(os.path.join(self.directory, os.path.basename(name))) as file:
                 return file[dataset][()]
         except (OSError, KeyError) as error:
-            raise Unreadable(f"{name}, which fields.xdmf names, cannot be read ({error}).") from None
+            raise Missing(f"{name}, which fields.xdmf names, cannot be read ({error}).") from None
 
     @functools.lru_cache(maxsize=64)
     def values(self, name, snapshot):

@@ -7,8 +7,7 @@ from pathlib import Path
 import jinja2
 
 from . import sections
-from .read import fail
-from .run import Missing
+from .read import Missing, fail
 
 TEMPLATES = Path(__file__).parent / "templates"
 # name in the template, Debian package, places where the package puts it

@@ -6,6 +6,10 @@ import sys
 from shared.signals import whole_rows
 
 
+class Missing(Exception):
+    """Why a run has nothing for a section: one sentence."""
+
+
 def fail(message):
     sys.exit(f"report: error: {message}")
 

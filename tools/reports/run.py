@@ -6,11 +6,7 @@ import re
 from shared.signals import whole_rows
 
 from . import fields
-from .read import fail, numbers_of, read_summary, signals_path
-
-
-class Missing(Exception):
-    """Why a run has nothing for a section: one sentence."""
+from .read import Missing, fail, numbers_of, read_summary, signals_path
 
 
 class Run:
@@ -52,10 +48,7 @@ class Run:
     @functools.cached_property
     def fields(self):
         """Snapshots of the run; raises Missing."""
-        try:
-            return fields.Fields(self.directory)
-        except fields.Unreadable as error:
-            raise Missing(str(error)) from None
+        return fields.Fields(self.directory)
 
     @functools.cached_property
     def breath(self):

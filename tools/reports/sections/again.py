@@ -1,7 +1,7 @@
 """The command that runs the same again, and all options that were used."""
 import shlex
 
-from ..run import Missing
+from ..read import Missing
 
 NAME, TITLE = "again", "How to run it again"
 OF_THE_PLACE = {"-output_dir", "-output_overwrite", "-restart", "-scene_view", "-scene_view_only", "-effects_view", "-progress"}

@@ -1,6 +1,6 @@
 """A row for each breath."""
 from ..charts import number
-from ..run import Missing
+from ..read import Missing
 from .numbers import ROWS
 
 NAME, TITLE = "breaths", "Breaths"

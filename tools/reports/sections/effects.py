@@ -1,7 +1,7 @@
 """Which effects act, and what each of them shows in the numbers of the run."""
 from .. import options
 from ..charts import number
-from ..run import Missing
+from ..read import Missing
 
 NAME, TITLE = "effects", "Effects"
 # rows of the energy balance that are of one effect

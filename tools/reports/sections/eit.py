@@ -5,7 +5,7 @@ from PIL import Image, ImageDraw
 from .. import pictures
 from ..charts import number
 from ..cuts import cut
-from ..run import Missing
+from ..read import Missing
 
 NAME, TITLE = "eit", "Image as in EIT"
 PIXELS, FINE, PLANES = 32, 16, 9  # fine pixels across a pixel; planes within the belt

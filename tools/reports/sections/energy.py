@@ -1,6 +1,6 @@
 """Where the work went: the balance of the run, closed to its residual, and its growth in time."""
 from ..charts import COLOURS, chart, number, series, thinned
-from ..run import Missing
+from ..read import Missing
 
 NAME, TITLE = "energy", "Energy"
 GIVEN = ["ventilator_work", "external", "muscles", "turning_springs", "pleural_pressure"]  # the left side of the balance

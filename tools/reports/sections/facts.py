@@ -1,6 +1,6 @@
 """Mass balance, mesh and solver in numbers."""
 from ..charts import number
-from ..run import Missing
+from ..read import Missing
 
 NAME, TITLE = "facts", "Mass, mesh and solver"
 

@@ -1,6 +1,6 @@
 """The single compartment P = PEEP + E (V - V0) + R Q that fits the last breath best, and what it leaves over in time."""
 from ..charts import chart, jumps, number, series, shades, thinned
-from ..run import Missing
+from ..read import Missing
 
 NAME, TITLE = "fit", "Fit of one compartment"
 

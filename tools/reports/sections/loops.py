@@ -1,8 +1,7 @@
 """Pressure-volume and flow-volume loops with hover values; where a static curve bends."""
 from ..charts import chart, jumps, series, thinned
 from ..pv_curve import describe
-from ..run import Missing
-from ..read import phase_spans
+from ..read import Missing, phase_spans
 
 NAME, TITLE = "loops", "Loops"
 

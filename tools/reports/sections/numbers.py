@@ -1,6 +1,6 @@
 """Clinical numbers with units, error bars and usual ranges; of several runs side by side."""
 from ..charts import number
-from ..run import Missing
+from ..read import Missing
 
 NAME, TITLE = "numbers", "Numbers"
 

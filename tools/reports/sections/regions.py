@@ -2,7 +2,7 @@
 import numpy as np
 
 from ..charts import chart, number, series
-from ..run import Missing
+from ..read import Missing
 
 NAME, TITLE = "regions", "Regional ventilation"
 BINS = 10

@@ -3,7 +3,7 @@ import os
 
 from .. import options, pictures
 from ..charts import number
-from ..run import Missing
+from ..read import Missing
 
 NAME, TITLE = "scene", "The scene"
 MODES = {"pcv": "pressure-controlled ventilation", "vcv": "volume-controlled ventilation", "supersyringe": "inflation and deflation in steps",

@@ -2,7 +2,7 @@
 import numpy as np
 
 from .. import pictures
-from ..run import Missing
+from ..read import Missing
 
 NAME, TITLE = "slices", "Sections through the lung"
 

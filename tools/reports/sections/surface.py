@@ -5,7 +5,7 @@ import matplotlib
 import numpy as np
 
 from ..cuts import rarer
-from ..run import Missing
+from ..read import Missing
 
 NAME, TITLE = "surface", "The lung as it moves"
 QUANTITIES = [("J_mean", "volume gained since rest, J − 1", "ml/ml", "viridis", 1),

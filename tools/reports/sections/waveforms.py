@@ -1,6 +1,6 @@
 """Pressure, flow and volume over time, phases shaded, a mark for each step; of several runs on one another."""
 from ..charts import chart, jumps, series, shades, thinned
-from ..run import Missing
+from ..read import Missing
 
 NAME, TITLE = "waveforms", "Waveforms"
 CURVES = [("airway_pressure_cmH2O", "airway pressure", "cmH₂O"), ("flow_ml_per_s", "flow into the lung", "ml/s"),
