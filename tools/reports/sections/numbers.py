@@ -36,13 +36,13 @@ RANGES = {
     "plateau_pressure_cmH2O": "held safe up to 30 (ARDS Network 2000)",
     "driving_pressure_cmH2O": "held safe below 15 (Amato et al. 2015)",
     "tidal_volume_ml": "6 to 8 ml per kg of predicted body weight; in ARDS 6 (ARDS Network 2000)",
-    "static_compliance_ml_per_cmH2O": "50 to 100 (Hess 2014)",
+    "static_compliance_ml_per_cmH2O": "35 to 100 with normal lungs (after Cairo)",
 }
 SOURCES = [
     "ARDS Network. Ventilation with lower tidal volumes as compared with traditional tidal volumes for acute lung injury and the "
     "acute respiratory distress syndrome. N Engl J Med 2000; 342: 1301.",
     "Amato MBP et al. Driving pressure and survival in the acute respiratory distress syndrome. N Engl J Med 2015; 372: 747.",
-    "Hess DR. Respiratory mechanics in mechanically ventilated patients. Respir Care 2014; 59: 1773.",
+    "Cairo JM. Pilbeam's Mechanical Ventilation: 35 to 50 and up to 100 ml/cmH2O in intubated patients.",
 ]
 
 
