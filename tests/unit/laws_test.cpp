@@ -12,20 +12,6 @@ double energy(const TissueLaw &law, const Tensor &F)
   return law.energy(state_of_F(F));
 }
 
-Tensor stress(const TissueLaw &law, const Tensor &F)
-{
-  Tensor P;
-  law.stress(state_of_F(F), P.data());
-  return P;
-}
-
-std::array<double, 81> tangent(const TissueLaw &law, const Tensor &F)
-{
-  std::array<double, 81> A;
-  law.tangent(state_of_F(F), A.data());
-  return A;
-}
-
 /// Stored [i][k][J][L].
 std::size_t entry(int i, int J, int k, int L)
 {

@@ -145,6 +145,22 @@ inline PointState state_of_F(const Tensor &F, const Tensor &rate = {})
   return s;
 }
 
+/// P' of a law at F, kPa.
+inline Tensor stress(const TissueLaw &law, const Tensor &F)
+{
+  Tensor P;
+  law.stress(state_of_F(F), P.data());
+  return P;
+}
+
+/// dP'/dF of a law at F, kPa, stored [i][k][J][L].
+inline std::array<double, 81> tangent(const TissueLaw &law, const Tensor &F)
+{
+  std::array<double, 81> A;
+  law.tangent(state_of_F(F), A.data());
+  return A;
+}
+
 /// df/dx at 0 by the central five-point formula.
 inline double derivative(const std::function<double(double)> &f, double h)
 {
@@ -218,9 +234,7 @@ inline double inflation_J(const TissueLaw &law, double p)
 {
   const auto excess = [&](double J) {
     const auto closed = inflation_pressure(law.name(), J);
-    Tensor P;
-    law.stress(state_of_F(std::cbrt(J) * identity), P.data());
-    return (closed ? *closed : P[0] / std::pow(J, 2. / 3)) - p;
+    return (closed ? *closed : stress(law, std::cbrt(J) * identity)[0] / std::pow(J, 2. / 3)) - p;
   };
   double low = 0.9;
   while (excess(low + 0.1) < 0 && low < 10) low += 0.1;

@@ -22,20 +22,6 @@ Tensor diagonal(const Stretches &l)
   return {l[0], 0, 0, 0, l[1], 0, 0, 0, l[2]};
 }
 
-Tensor stress(const TissueLaw &law, const Tensor &F)
-{
-  Tensor P;
-  law.stress(state_of_F(F), P.data());
-  return P;
-}
-
-std::array<double, 81> tangent(const TissueLaw &law, const Tensor &F)
-{
-  std::array<double, 81> A;
-  law.tangent(state_of_F(F), A.data());
-  return A;
-}
-
 /// Of the law and of the network, in any axes.
 void compare(const FreeCell::Tissue &tissue, const Stretches &l, int steps, double noise)
 {
