@@ -4,8 +4,11 @@
 #include "pulmo/base/words.hpp"
 
 #include <algorithm>
+#include <cstdio>
+#include <cstdlib>
 #include <map>
 #include <set>
+#include <sstream>
 
 namespace pulmo {
 
