@@ -26,7 +26,6 @@ install(PROGRAMS tools/report tools/lung_mesh tools/sphere_mesh tools/cell_value
 install(DIRECTORY tools/accuracy tools/benchmarks tools/meshing tools/paper tools/reports tools/shared
         DESTINATION ${data}/tools FILES_MATCHING PATTERN "*.py")
 install(DIRECTORY tools/reports/templates DESTINATION ${data}/tools/reports)
-install(FILES tools/reports/options.csv DESTINATION ${data}/tools/reports)
 install(FILES docs/paper/page.md.in DESTINATION ${data}/docs/paper)
 # the tools' build/pulmo is the installed program
 file(RELATIVE_PATH to_program ${CMAKE_INSTALL_FULL_DATADIR}/pulmo ${CMAKE_INSTALL_FULL_BINDIR})

@@ -1,6 +1,7 @@
 // summary.json and energy.csv.
 #include "pulmo/base/units.hpp"
 #include "pulmo/fem/free_boundary.hpp"
+#include "pulmo/observers/ledger.hpp"
 #include "pulmo/observers/output.hpp"
 
 #include <nlohmann/json.hpp>
@@ -184,6 +185,20 @@ Json errors_json(const ErrorReport &report)
   return json;
 }
 
+/// What each effect adds and takes, on rank 0.
+Json ledger_json(const Scene &scene, const Model &model, const StageSeconds &seconds)
+{
+  Json list = Json::array();
+  for (const LedgerEntry &entry : ledger(scene, model))
+    list.push_back({{"effect", entry.effect},
+                    {"fields", entry.fields},
+                    {"terms", entry.terms},
+                    {"remembered_bytes", entry.bytes},
+                    {"seconds", entry.seconds},
+                    {"share_of_run", seconds.total > 0 ? Json(entry.seconds / seconds.total) : Json(nullptr)}});
+  return list;
+}
+
 /// Volume of the lung of a prestressed scene without pressure, each cell inflated back on its own, mm^3. Collective.
 PetscErrorCode unloaded_volume(const Scene &scene, const Model &model, PetscReal &volume)
 {
@@ -321,6 +336,7 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
     json["tissue"] = scene.tissue().law().name();
     json["effects"] = Json::array();
     for (const Effect *effect : scene.active()) json["effects"].push_back(effect->name());
+    json["ledger"] = ledger_json(scene, model, s);
     json["elements"] = scene.facts().elements.name();
     json["integration"] = model.own_integration() ? "pulmo" : "basic";
     json["version"] = PULMO_VERSION;

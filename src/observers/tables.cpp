@@ -1,10 +1,8 @@
 // What a run prints at its end.
 #include "pulmo/base/units.hpp"
-#include "pulmo/fem/point_memory.hpp"
 #include "pulmo/observers/output.hpp"
 
 #include <cmath>
-#include <map>
 
 namespace pulmo {
 
@@ -186,77 +184,6 @@ PetscErrorCode print_error_bars(MPI_Comm comm, const ErrorReport &report)
     PetscCall(
         PetscPrintf(comm, "%s %s %.3g s", i > 1 ? "," : "", report.levels[i].name.c_str(), report.levels[i].seconds));
   PetscCall(PetscPrintf(comm, ".\n"));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode print_ledger(MPI_Comm comm, const Scene &scene, const Model &model, const StageSeconds &seconds)
-{
-  const IntegrationLog &log = model.assembly().log();
-  const Composition &composition = model.composition();
-  const auto &fields = composition.fields();
-  std::map<std::string, double> spent;
-  double timed = 0;
-
-  PetscFunctionBeginUser;
-  auto left = log.seconds;
-  // what was timed, scaled up; a callback of several terms counts for the first that registered it
-  const double scale =
-      log.timed_cells > 0 ? (double)(log.residual_cells + log.jacobian_cells) / (double)log.timed_cells : 0;
-  const auto charge = [&](auto callback, const std::string &effect, double factor) {
-    const auto entry = left.find(reinterpret_cast<void (*)(void)>(callback));
-    if (!callback || entry == left.end()) return;
-    spent[effect] += entry->second * factor;
-    left.erase(entry);
-  };
-  for (const Term &t : composition.terms()) {
-    for (auto f : {t.f0, t.f1}) charge(f, t.effect, scale);
-    for (auto g : {t.g0, t.g1, t.g2, t.g3}) charge(g, t.effect, scale);
-    for (auto f : {t.bd_f0, t.bd_f1}) charge(f, t.effect, 1);
-    for (auto g : {t.bd_g0, t.bd_g1, t.bd_g2, t.bd_g3}) charge(g, t.effect, 1);
-  }
-  for (const auto &[effect, s] : spent) timed += s;
-  PetscCall(PetscPrintf(
-      comm, "\nEffects of this scene (seconds in its terms; one block of cells in %d is timed)\n%-16s %-22s %-9s %s\n",
-      (int)Assembly::timed_share, "effect", "fields", "seconds", "share of run, terms, blocks"));
-  for (const Effect *effect : scene.active()) {
-    const std::string name = effect->name();
-    std::string own_fields, terms;
-    for (const FieldSpec &f : fields)
-      if (f.effect == name) own_fields += (own_fields.empty() ? "" : ", ") + f.name + " P" + std::to_string(f.degree);
-    for (const Term &t : composition.terms()) {
-      if (t.effect != name) continue;
-      const std::string where = t.surface.empty() ? "" : " on " + t.surface;
-      if (t.trial < 0)
-        terms += "\n    " + t.name + where + "  (row " + fields[t.test].name + ")";
-      else
-        terms += "\n    " + t.name + where + "  [" + fields[t.test].name + ", " + fields[t.trial].name + "]";
-    }
-    for (const Constraint &c : composition.constraints())
-      if (c.effect == name)
-        terms += "\n    " + c.name + " prescribed" + (c.surface.empty() ? " at vertices" : " on " + c.surface) + "  (" +
-                 fields[c.field].name + ")";
-    for (const MemorySpec &m : composition.memories())
-      if (m.effect == name)
-        terms += "\n    remembers " + std::to_string(m.quantities.size()) + " quantities at each point of " +
-                 (m.surface.empty() ? "a cell" : "a facet of " + m.surface) + " (" +
-                 std::to_string(model.memory()->bytes(m)) + " bytes on this rank)";
-    for (const ScalarGroup &group : composition.scalar_groups())
-      if (group.effect == name)
-        for (const ScalarSpec &s : group.scalars)
-          terms += "\n    unknown pressure " + s.name +
-                   (s.surfaces.empty() ? "" : " on " + s.surfaces.front().text() + " (one more solve a Newton step)");
-    PetscCall(PetscPrintf(comm, "%-16s %-22s %9.4f %5.1f %%%s\n", name.c_str(),
-                          own_fields.empty() ? "-" : own_fields.c_str(), spent[name],
-                          seconds.total > 0 ? 100 * spent[name] / seconds.total : 0, terms.c_str()));
-  }
-  const double residual_points = log.residual_cells > 0 ? (double)log.residual_calls / (double)log.residual_cells : 0;
-  const double jacobian_points = log.jacobian_cells > 0 ? (double)log.jacobian_calls / (double)log.jacobian_cells : 0;
-  PetscCall(PetscPrintf(
-      comm,
-      "callbacks per cell: residual %.0f, Jacobian %.0f; run: setup %.3f s, residual %.3f s, Jacobian %.3f s, "
-      "solve %.3f s, output %.3f s (callbacks above %.3f s)\n",
-      residual_points, jacobian_points, seconds.setup, seconds.residual, seconds.jacobian, seconds.solve,
-      seconds.output, timed));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -3,6 +3,7 @@
 #include "pulmo/base/units.hpp"
 #include "pulmo/mesh/read_mesh.hpp"
 #include "pulmo/observers/output.hpp"
+#include "pulmo/program/other_run.hpp"
 #include "pulmo/pulmo.hpp"
 
 #include <algorithm>
@@ -26,24 +27,11 @@ constexpr double least_coarsening = 1.2;
 /// Solver tolerances are tightened by this factor, but not to rounding.
 constexpr PetscReal tighter = 0.01, tightest = 1e-12;
 
-/// Options of what a run leaves behind: a level writes nothing.
-constexpr const char *output_prefixes[] = {"-output",     "-progress", "-effects",        "-energy",
-                                           "-checkpoint", "-restart",  "-error_estimate", "-scene"};
-
 /// The runs that are compared, in this order: what is wrong with the other mesh is said before the rest is run.
 enum { fine, other, twice, four_times, tight, n_levels };
 
 /// What each step leaves undone may add up, and the solver is judged by runs of so many times fewer steps.
 constexpr double steps_saved = 4;
-
-bool is_output_option(const std::string &name)
-{
-  return prints(name) ||
-         std::any_of(std::begin(output_prefixes), std::end(output_prefixes), [&](const std::string &prefix) {
-           return name.compare(0, prefix.size(), prefix) == 0 &&
-                  (name.size() == prefix.size() || name[prefix.size()] == '_');
-         });
-}
 
 std::string text_of(double v)
 {
@@ -52,34 +40,6 @@ std::string text_of(double v)
   s << v;
   return s.str();
 }
-
-/// Another options database in place of PETSc's default one while it lives.
-class OptionsInForce {
-public:
-  OptionsInForce() = default;
-  ~OptionsInForce()
-  {
-    if (pushed_) (void)PetscOptionsPop();
-    if (options_) (void)PetscOptionsDestroy(&options_);
-  }
-  OptionsInForce(const OptionsInForce &) = delete;
-  OptionsInForce &operator=(const OptionsInForce &) = delete;
-
-  PetscErrorCode put(const OptionList &list)
-  {
-    PetscFunctionBeginUser;
-    PetscCall(PetscOptionsCreate(&options_));
-    for (const auto &[name, value] : list)
-      PetscCall(PetscOptionsSetValue(options_, name.c_str(), value.empty() ? nullptr : value.c_str()));
-    PetscCall(PetscOptionsPush(options_));
-    pushed_ = true;
-    PetscFunctionReturn(PETSC_SUCCESS);
-  }
-
-private:
-  PetscOptions options_ = nullptr;
-  bool pushed_ = false;
-};
 
 /// How many times larger the cells of @p other are than those of @p level.
 double cell_size_ratio(const ErrorLevel &level, const ErrorLevel &other)
@@ -236,7 +196,7 @@ PetscErrorCode ErrorEstimate::try_other_mesh(const Options &options, const Scene
 
   PetscFunctionBeginUser;
   PetscCall(other_mesh(changes, name));
-  PetscCall(level_options(options, changes, list));
+  PetscCall(options_of_other_run(options, changes, list));
   PetscCall(in_force.put(list));
   PetscCall(other.declare(others));
   PetscCall(other.prepare(others));
@@ -246,17 +206,6 @@ PetscErrorCode ErrorEstimate::try_other_mesh(const Options &options, const Scene
   ErrorLevel level = level_of(other);
   level.name = name;
   PetscCall(check_other_mesh(options.comm(), level_of(scene), level));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-/// The options of the run, but of what it leaves behind, with @p changes.
-PetscErrorCode ErrorEstimate::level_options(const Options &options, const OptionList &changes, OptionList &list) const
-{
-  PetscFunctionBeginUser;
-  PetscCall(options.all_given(list));
-  list.erase(std::remove_if(list.begin(), list.end(), [](const auto &o) { return is_output_option(o.first); }),
-             list.end());
-  list.insert(list.end(), changes.begin(), changes.end()); // the last one counts
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -297,7 +246,7 @@ PetscErrorCode ErrorEstimate::run_level(const Options &options, const Output &ou
 
   PetscFunctionBeginUser;
   PetscCall(PetscTime(&begin));
-  PetscCall(level_options(options, changes, list));
+  PetscCall(options_of_other_run(options, changes, list));
   OptionsInForce in_force;
   PetscCall(in_force.put(list));
 

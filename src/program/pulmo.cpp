@@ -5,7 +5,9 @@
 #include "pulmo/fem/held.hpp"
 #include "pulmo/input/errors.hpp"
 #include "pulmo/observers/checkpoint.hpp"
+#include "pulmo/observers/ledger.hpp"
 #include "pulmo/physics/parameter_fields.hpp"
+#include "pulmo/program/dry_run.hpp"
 #include "pulmo/program/error_estimate.hpp"
 #include "pulmo/program/notes.hpp"
 #include "pulmo/program/scene_view.hpp"
@@ -232,9 +234,10 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   Simulation &simulation = run.simulation();
   Output output;
   ErrorEstimate error_estimate(registry);
-  SceneView scene_view;
+  DryRun dry_run(registry);
   Checkpoint checkpoint(options, output, scene, run.model(), simulation);
-  bool view_effects = false, audit_energy = true, asked_to_stop = false;
+  SceneWords words;
+  bool view_effects = false, view_scene = false, only_scene = false, audit_energy = true, asked_to_stop = false;
   PetscBool help, has_mesh;
 
   PetscFunctionBeginUser;
@@ -244,7 +247,11 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   PetscCall(output.declare(options));
   PetscCall(checkpoint.declare(options));
   PetscCall(error_estimate.declare(options));
-  PetscCall(scene_view.declare(options));
+  PetscCall(dry_run.declare(options));
+  options.group("scene", "the scene in words");
+  PetscCall(options.flag("view", "print before the run what is in the scene, what is not, and how far its tissue goes",
+                         view_scene));
+  PetscCall(options.flag("view_only", "print that and stop", only_scene));
   options.group("effects", "ledger");
   PetscCall(options.flag("view", "print effects, fields, terms, blocks and seconds at the end", view_effects));
   options.group("energy", "energy balance");
@@ -260,10 +267,12 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
     PetscFunctionReturn(PETSC_SUCCESS);
   }
   PetscCall(check_held(comm, scene, run.model().composition()));
-  PetscCall(scene_view.print(options, scene, run.model(), simulation));
+  PetscCall(describe_scene(options, scene, run.model(), simulation, words));
+  if (view_scene || only_scene || dry_run.in_use()) PetscCall(print_scene(comm, words));
   PetscCall(look_ahead(comm, scene, run.model(), simulation, run.settle_note()));
   PetscCall(error_estimate.check(options, scene));
-  if (scene_view.only()) {
+  PetscCall(dry_run.check(options, checkpoint.restart()));
+  if (only_scene) {
     finished = true;
     PetscFunctionReturn(PETSC_SUCCESS);
   }
@@ -303,6 +312,11 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   }
   UnusedOptions unused(options, scene);
   simulation.add(unused);
+  if (dry_run.in_use()) {
+    PetscCall(dry_run.make(options, scene, simulation));
+    finished = true;
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
   simulation.add(signals);
   simulation.add(fields);
   if (output.progress()) simulation.add(progress);
@@ -313,6 +327,7 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   if (restarts) PetscCall(checkpoint.restore());
   PetscCall(error_estimate.check_sessions(options, checkpoint.numerics_changed()));
   PetscCall(output.prepare(options, checkpoint.restart(), fields.files()));
+  PetscCall(write_scene(options, words, output.path("scene.json")));
   if (restarts) PetscCall(fields.carry_over(checkpoint.restart_directory()));
   {
     StopSignal signal(comm);

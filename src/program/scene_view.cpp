@@ -2,6 +2,10 @@
 #include "pulmo/program/scene_view.hpp"
 
 #include "pulmo/base/units.hpp"
+#include "pulmo/observers/output.hpp"
+#include "pulmo/pulmo.hpp"
+
+#include <nlohmann/json.hpp>
 
 #include <algorithm>
 #include <cctype>
@@ -34,15 +38,24 @@ std::string capital(std::string text)
   return text;
 }
 
-/// "; stiffness 0.08 kPa/mm; direction full": what the options of an effect say.
-std::string settings(const Options &options, const std::string &effect)
+/// What of an effect's options is told: those that have a value, and are not the effect's own "on".
+std::vector<Options::Setting> told_settings(const Options &options, const std::string &effect)
 {
-  std::string text;
-  for (const Options::Setting &s : options.settings(effect)) {
-    if (s.value.empty() || (s.name.empty() && (s.value == "on" || s.value == "true"))) continue;
+  std::vector<Options::Setting> told;
+  for (const Options::Setting &s : options.settings(effect))
+    if (!s.value.empty() && !(s.name.empty() && (s.value == "on" || s.value == "true"))) told.push_back(s);
+  return told;
+}
+
+/// "Chest wall: springs on the pleura; stiffness 0.08 kPa/mm; direction full." or "No gravity: nothing has weight
+/// (-gravity)."
+std::string sentence(const SceneWords::Effect &effect)
+{
+  if (!effect.active) return "No " + with_blanks(effect.name) + ": " + effect.words + " (-" + effect.name + ").";
+  std::string text = capital(with_blanks(effect.name)) + ": " + effect.words;
+  for (const Options::Setting &s : effect.settings)
     text += "; " + (s.name.empty() ? s.value : s.name + " " + s.value) + (s.unit.empty() ? "" : " " + s.unit);
-  }
-  return text;
+  return text + ".";
 }
 
 /// "inspiration of breath 1 from 0 to 1 s: pressure to 6 cmH2O within 0.1 s".
@@ -78,19 +91,17 @@ void describe_mesh(const Scene &scene, std::vector<std::string> &lines)
       lines.push_back("Volume " + part.name + " has " + number(part.measure / units::mm3_per_ml) + " ml.");
 }
 
-void describe_effects(const Options &options, const Scene &scene, std::vector<std::string> &in,
-                      std::vector<std::string> &out)
+void describe_effects(const Options &options, const Scene &scene, std::vector<SceneWords::Effect> &effects)
 {
   for (const auto &effect : scene.effects()) {
     const std::string name = effect->name(), absence = effect->absence();
-    if (effect->active())
-      in.push_back(capital(with_blanks(name)) + ": " + effect->describe(scene.facts()) + settings(options, name) + ".");
-    else
-      out.push_back("No " + with_blanks(name) + ": " + (absence.empty() ? effect->about() : absence) + " (-" + name +
-                    ").");
+    const bool active = effect->active();
+    effects.push_back({name,
+                       active            ? effect->describe(scene.facts())
+                       : absence.empty() ? effect->about()
+                                         : absence,
+                       active, active ? told_settings(options, name) : std::vector<Options::Setting>()});
   }
-  out.emplace_back(
-      "What no option brings in (blood, fluid, fissures, gas exchange, ...): docs/effects/not_modelled.md.");
 }
 
 void describe_breathing(const Scene &scene, std::vector<std::string> &lines)
@@ -143,40 +154,72 @@ PetscErrorCode describe_numerics(const Options &options, const Simulation &simul
 
 } // namespace
 
-PetscErrorCode SceneView::declare(Options &options)
+PetscErrorCode describe_scene(const Options &options, const Scene &scene, const Model &model,
+                              const Simulation &simulation, SceneWords &words)
 {
   PetscFunctionBeginUser;
-  options.group("scene", "the scene in words");
-  PetscCall(options.flag("view", "print before the run what is in the scene, what is not, and how far its tissue goes",
-                         view_));
-  PetscCall(options.flag("view_only", "print that and stop", only_));
+  describe_mesh(scene, words.mesh);
+  describe_effects(options, scene, words.effects);
+  PetscCall(describe_range(scene, model, words.range));
+  describe_breathing(scene, words.breathing);
+  PetscCall(describe_numerics(options, simulation, words.numerics));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode SceneView::print(const Options &options, const Scene &scene, const Model &model,
-                                const Simulation &simulation) const
+PetscErrorCode print_scene(MPI_Comm comm, const SceneWords &words)
 {
-  const MPI_Comm comm = options.comm();
-  std::vector<std::string> mesh, in, out, range, breathing, numerics;
+  std::vector<std::string> in, out;
 
   PetscFunctionBeginUser;
-  if (!view_ && !only_) PetscFunctionReturn(PETSC_SUCCESS);
-  describe_mesh(scene, mesh);
-  describe_effects(options, scene, in, out);
-  PetscCall(describe_range(scene, model, range));
-  describe_breathing(scene, breathing);
-  PetscCall(describe_numerics(options, simulation, numerics));
-  const std::pair<const char *, const std::vector<std::string> &> sections[] = {{"The mesh", mesh},
-                                                                                {"In this scene", in},
-                                                                                {"Not in this scene", out},
-                                                                                {"How far the tissue goes", range},
-                                                                                {"How it breathes", breathing},
-                                                                                {"How it is solved", numerics}};
+  for (const SceneWords::Effect &effect : words.effects) (effect.active ? in : out).push_back(sentence(effect));
+  out.emplace_back(
+      "What no option brings in (blood, fluid, fissures, gas exchange, ...): docs/effects/not_modelled.md.");
+  const std::pair<const char *, const std::vector<std::string> &> sections[] = {
+      {"The mesh", words.mesh},
+      {"In this scene", in},
+      {"Not in this scene", out},
+      {"How far the tissue goes", words.range},
+      {"How it breathes", words.breathing},
+      {"How it is solved", words.numerics}};
   for (const auto &[title, lines] : sections) {
     PetscCall(PetscPrintf(comm, "\n%s\n", title));
     for (const std::string &line : lines) PetscCall(PetscPrintf(comm, "  %s\n", line.c_str()));
   }
   PetscCall(PetscPrintf(comm, "\n"));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode write_scene(const Options &options, const SceneWords &words, const std::string &file)
+{
+  using Json = nlohmann::ordered_json;
+  const MPI_Comm comm = options.comm();
+  OptionList given;
+  PetscMPIInt size;
+
+  PetscFunctionBeginUser;
+  PetscCall(options.all_given(given));
+  PetscCallMPI(MPI_Comm_size(comm, &size));
+  Json json = {{"version", version()},
+               {"ranks", size},
+               {"mesh", words.mesh},
+               {"effects", Json::array()},
+               {"tissue_range", words.range},
+               {"breathing", words.breathing},
+               {"numerics", words.numerics},
+               {"options", Json::object()},
+               {"option_sources", Json::object()}};
+  for (const SceneWords::Effect &effect : words.effects) {
+    Json entry = {
+        {"name", effect.name}, {"active", effect.active}, {"words", effect.words}, {"settings", Json::array()}};
+    for (const Options::Setting &s : effect.settings)
+      entry["settings"].push_back({{"name", s.name}, {"value", s.value}, {"unit", s.unit}});
+    json["effects"].push_back(entry);
+  }
+  for (const auto &[name, value] : given) {
+    json["options"][name] = value;
+    if (const std::string source = options.source(name); !source.empty()) json["option_sources"][name] = source;
+  }
+  PetscCall(write_text(comm, json.dump(2, ' ', false, Json::error_handler_t::replace) + "\n", file));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -285,7 +285,7 @@ PetscErrorCode Simulation::keep_step(PetscReal dt)
 
   PetscFunctionBeginUser;
   PetscCall(TSRestartStep(ts_)); // as in reject()
-  PetscCall(heed_signal(TS_DIVERGED_STEP_REJECTED));
+  PetscCall(heed_request(TS_DIVERGED_STEP_REJECTED));
   PetscCall(TSGetAdapt(ts_, &adapt));
   PetscCall(TSSetTimeStep(ts_, dt / adapt->scale_solve_failed));
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -327,7 +327,7 @@ PetscErrorCode Simulation::reject(PetscReal dt, const std::string &reason, Petsc
   const PetscReal next = dt * adapt->scale_solve_failed;
   if (next < std::max(adapt->dt_min, least_step * asked_dt()))
     PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
-  PetscCall(heed_signal(TS_DIVERGED_STEP_REJECTED));
+  PetscCall(heed_request(TS_DIVERGED_STEP_REJECTED));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -411,7 +411,7 @@ PetscErrorCode Simulation::after_step()
   PetscCall(report(row, measures));
   if (crawled_ == crawling_steps) PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
   if (ends_early) PetscCall(TSSetConvergedReason(ts_, TS_CONVERGED_USER));
-  if (!same(t, end_)) PetscCall(heed_signal(TS_CONVERGED_USER));
+  if (!same(t, end_)) PetscCall(heed_request(TS_CONVERGED_USER));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -426,10 +426,10 @@ void Simulation::list_scalars(SignalRow &row) const
   }
 }
 
-PetscErrorCode Simulation::heed_signal(TSConvergedReason reason)
+PetscErrorCode Simulation::heed_request(TSConvergedReason reason)
 {
   PetscFunctionBeginUser;
-  if (stop_signal_) PetscCall(stop_signal_->asked(stopped_));
+  if (stop_request_) PetscCall(stop_request_->asked(stopped_));
   if (stopped_) PetscCall(TSSetConvergedReason(ts_, reason));
   PetscFunctionReturn(PETSC_SUCCESS);
 }

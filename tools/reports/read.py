@@ -37,17 +37,29 @@ def numbers_of(path):
         fail(f"{path} is damaged: a value is missing or not a number")
 
 
+def of_json(directory, name):
+    """What a file of the run says; None if it is not there."""
+    path = os.path.join(directory, name)
+    try:
+        with open(path) as f:
+            return json.load(f)
+    except FileNotFoundError:
+        return None
+    except ValueError as error:
+        fail(f"{path} is damaged: {error}")
+
+
+def read_scene(directory):
+    """What a run says of its scene when it begins; empty if it says nothing (an older version of pulmo)."""
+    return of_json(directory, "scene.json") or {}
+
+
 def read_summary(directory, end):
     """What summary.json says, or failure.json, and why the run is not finished (empty if it is). `end`: of its rows, s."""
     for name in "summary.json", "failure.json":
-        path = os.path.join(directory, name)
-        try:
-            with open(path) as f:
-                summary = json.load(f)
-        except FileNotFoundError:
+        summary = of_json(directory, name)
+        if summary is None:
             continue
-        except json.JSONDecodeError as error:
-            fail(f"{path} is damaged: {error}")
         return summary, f"FAILED: {summary.get('failure', 'no reason given')}" if name == "failure.json" else ""
     return {}, f"NOT FINISHED: at work, stopped or killed; rows up to {end:g} s"
 

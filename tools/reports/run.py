@@ -6,7 +6,7 @@ import re
 from shared.signals import whole_rows
 
 from . import fields
-from .read import Missing, fail, numbers_of, read_summary, signals_path
+from .read import Missing, fail, numbers_of, read_scene, read_summary, signals_path
 
 
 class Run:
@@ -18,7 +18,9 @@ class Run:
         self.time = self.signals["time_s"]
         self.summary, self.unfinished = read_summary(directory, self.time[-1])
         self.state = "failed" if self.unfinished and self.summary else "unfinished" if self.unfinished else "finished"
-        self.options = self.summary.get("options") or {}
+        self.scene = read_scene(directory)
+        self.options = self.summary.get("options") or self.scene.get("options") or {}
+        self.sources = self.summary.get("option_sources") or self.scene.get("option_sources") or {}
 
     @property
     def moving(self):

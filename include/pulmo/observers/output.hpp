@@ -185,7 +185,4 @@ PetscErrorCode print_numbers(MPI_Comm comm, const Output &output, const Scene &s
 /// Prints each clinical number with its error bar, and what the bars cost.
 PetscErrorCode print_error_bars(MPI_Comm comm, const ErrorReport &report);
 
-/// Prints the ledger of `-effects_view`: effect, fields, terms, blocks, seconds.
-PetscErrorCode print_ledger(MPI_Comm comm, const Scene &scene, const Model &model, const StageSeconds &seconds);
-
 } // namespace pulmo

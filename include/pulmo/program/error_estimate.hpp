@@ -32,7 +32,6 @@ public:
 
 private:
   PetscErrorCode try_other_mesh(const Options &options, const Scene &scene) const;
-  PetscErrorCode level_options(const Options &options, const OptionList &changes, OptionList &list) const;
   PetscErrorCode other_mesh(OptionList &changes, std::string &name) const;
   PetscErrorCode run_level(const Options &options, const Output &output, const OptionList &changes,
                            ErrorLevel &level) const;

@@ -37,11 +37,11 @@ public:
   /// Counts what was done before the run as set-up, s.
   void setup_took(double seconds) { seconds_.setup = seconds; }
   void add(Observer &observer) { observers_.push_back(&observer); }
-  /// Lets a signal end the run after the step at hand. @p signal must outlive the run.
-  void heed(StopSignal &signal) { stop_signal_ = &signal; }
+  /// Lets @p request end the run after the step at hand. It must outlive the run.
+  void heed(StopRequest &request) { stop_request_ = &request; }
   /// Writes or reads the run after its last accepted step, observers included; after reading, run() goes on from there.
   PetscErrorCode persist(Archive &archive);
-  /// Runs to the end. @p finished is false if a signal stopped the run, or if no step could be accepted any more;
+  /// Runs to the end. @p finished is false if the run was asked to stop, or if no step could be accepted any more;
   /// failure_text() then tells why.
   PetscErrorCode run(bool &finished);
 
@@ -49,7 +49,8 @@ public:
   Vec local_state() const { return before_; } ///< the same, local, constrained values in place
   PetscReal time() const { return accepted_.time; }
   bool at_end() const { return same(accepted_.time, end_); }
-  bool stopped() const { return stopped_; } ///< by a signal
+  PetscReal end() const { return end_; }    ///< of the run, s
+  bool stopped() const { return stopped_; } ///< as asked
   const std::vector<SignalRow> &rows() const { return rows_; }
   PetscReal mass_balance_error() const { return worst_balance_; } ///< largest of the run, mm^3
   PetscReal min_J() const { return min_J_; }
@@ -100,8 +101,8 @@ private:
   /// Finds the phase that goes on at what was read.
   PetscErrorCode check_state();
   PetscErrorCode resume(const Archive &archive, PetscInt index, PetscReal wanted_dt, PetscReal phase_end);
-  /// Ends the run with @p reason if a signal asks to stop.
-  PetscErrorCode heed_signal(TSConvergedReason reason);
+  /// Ends the run with @p reason if it is asked to stop.
+  PetscErrorCode heed_request(TSConvergedReason reason);
   PetscErrorCode offer_fixed_stress(KSP ksp);
   /// Two times closer than this share of the step are the same.
   static constexpr PetscReal same_time = 1e-9;
@@ -163,7 +164,7 @@ private:
   Lagging lagging_;
   FixedStress fixed_stress_;
   std::vector<Observer *> observers_;
-  StopSignal *stop_signal_ = nullptr;
+  StopRequest *stop_request_ = nullptr;
   TSHandle ts_;
   MatHandle matrix_;
   VecHandle state_, local_, rate_, local_residual_, before_;
@@ -195,7 +196,7 @@ private:
   bool tests_jacobian_ = false; ///< -snes_test_jacobian
   bool cut_ = false;            ///< the step at hand was cut
   bool resumed_ = false;        ///< the run goes on from what was read
-  bool stopped_ = false;        ///< by a signal
+  bool stopped_ = false;        ///< as asked
   int crawled_ = 0;             ///< accepted steps in a row that were tiny
   Measures inverted_measures_;
   std::vector<FailedAttempt> failures_;

@@ -4,7 +4,8 @@ import shlex
 from ..read import Missing
 
 NAME, TITLE = "again", "How to run it again"
-OF_THE_PLACE = {"-output_dir", "-output_overwrite", "-restart", "-scene_view", "-scene_view_only", "-effects_view", "-progress"}
+OF_THE_PLACE = {"-output_dir", "-output_overwrite", "-restart", "-scene_view", "-scene_view_only", "-effects_view", "-progress",
+                "-dry_run", "-dry_run_seconds"}
 
 
 def quoted(name, value):
@@ -16,16 +17,15 @@ def quoted(name, value):
 
 def command(run):
     """One line for each option that was given, as it counted in the end."""
-    given = run.summary.get("option_sources") or {}
-    lines = [f"mpiexec -n {run.summary['ranks']} pulmo" if run.summary.get("ranks", 1) > 1 else "pulmo"]
-    lines += [quoted(name, value) for name, value in run.options.items() if name in given and name not in OF_THE_PLACE]
+    ranks = run.summary.get("ranks") or run.scene.get("ranks", 1)
+    lines = [f"mpiexec -n {ranks} pulmo" if ranks > 1 else "pulmo"]
+    lines += [quoted(name, value) for name, value in run.options.items() if name in run.sources and name not in OF_THE_PLACE]
     lines.append("-output_dir results/again")
     return " \\\n  ".join(lines)
 
 
 def build(run):
     if not run.options:
-        raise Missing("A run writes its options when it ends, and this one has not ended.")
-    sources = run.summary.get("option_sources") or {}
-    return {"command": command(run), "restarted": bool(run.options.get("-restart")), "version": run.summary.get("version", "?"),
-            "options": [(name, value, sources.get(name, "default")) for name, value in run.options.items()]}
+        raise Missing("The directory says nothing of the options: the run has not ended, and an older version of pulmo made it.")
+    return {"command": command(run), "restarted": bool(run.options.get("-restart")), "version": run.summary.get("version") or run.scene.get("version", "?"), "ended": bool(run.summary),
+            "options": [(name, value, run.sources.get(name, "default")) for name, value in run.options.items()]}

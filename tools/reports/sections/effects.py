@@ -1,5 +1,4 @@
-"""Which effects act, and what each of them shows in the numbers of the run."""
-from .. import options
+"""Which effects act, what each of them adds to the equations, what it costs, and its part of the energy."""
 from ..charts import number
 from ..read import Missing
 
@@ -12,13 +11,19 @@ WORK = {"airflow": ["resistive"], "tissue": ["elastic_tissue"], "chest_wall": ["
 
 
 def build(run):
-    on = run.summary.get("effects")
+    on = [effect for effect in run.scene.get("effects", ()) if effect["active"]]
     if not on:
-        raise Missing("A run names its effects when it ends.")
+        raise Missing("The directory has no scene.json, in which a run names its effects: an older version of pulmo made it.")
     energy = run.summary.get("energy_j") or {}
-    return {"rows": [{"name": name.replace("_", " "), "what": options.effect(name),
-                      "energy": [(key.replace("_", " "), number(energy[key])) for key in WORK.get(name, ()) if key in energy],
-                      "given": [f"-{name}_{word.replace(' ', '_')} {value}{' ' + unit if unit else ''}"
-                                for word, value, unit in options.given(run.options, name)
-                                if f"-{name}_{word.replace(' ', '_')}" in (run.summary.get("option_sources") or {})]}
-                     for name in on]}
+    ledger = {entry["effect"]: entry for entry in run.summary.get("ledger") or ()}
+
+    def row(effect):
+        name, entry = effect["name"], ledger.get(effect["name"])
+        given = [(f"-{name}_{s['name']}".rstrip("_").replace(" ", "_"), s) for s in effect["settings"]]
+        return {"name": name.replace("_", " "), "what": effect["words"],
+                "energy": [(key.replace("_", " "), number(energy[key])) for key in WORK.get(name, ()) if key in energy],
+                "given": [f"{option} {s['value']} {s['unit']}".rstrip() for option, s in given if option in run.sources],
+                "adds": ([*(f"field {field}" for field in entry["fields"]), *entry["terms"]] if entry else []),
+                "seconds": number(entry["seconds"], 3) if entry else None}
+
+    return {"rows": [row(effect) for effect in on], "ended": bool(ledger)}

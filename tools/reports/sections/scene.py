@@ -1,52 +1,39 @@
-"""The scene in words, as -scene_view has them, from the options that the run used; and a picture of the lung."""
+"""The scene in words, as the run told them when it began, and a picture of the lung."""
 import os
 
-from .. import options, pictures
-from ..charts import number
+from .. import pictures
 from ..read import Missing
 
 NAME, TITLE = "scene", "The scene"
-MODES = {"pcv": "pressure-controlled ventilation", "vcv": "volume-controlled ventilation", "supersyringe": "inflation and deflation in steps",
-         "programme": "phases of a programme"}
 
 
-def sentence(run, effect):
-    """'Tissue: what it is; birzle; porosity 0.99; c 0.3567 kPa.'"""
-    if effect == "ventilator":
-        parts = [MODES.get(run.options.get("-ventilator"), options.effect(effect))]
-    else:
-        parts = [words for words in [options.effect(effect)] if words]
-    choice = run.options.get(f"-{effect}", "")
-    if choice not in ("", "on"):
-        parts.append(choice)
-    for name, value, unit in options.given(run.options, effect):
-        parts.append(" ".join(word for word in (name, value if value else "on", unit) if word))
-    return effect.replace("_", " ").capitalize(), "; ".join(parts) + "."
+def pretty(unit):
+    """A unit as people write it: cmH₂O, mm², kg/m³."""
+    return unit.replace("H2O", "H₂O").replace("^2", "²").replace("^3", "³")
 
 
-def mesh(run):
-    summary = run.summary
-    lines = [f"The mesh {run.options.get('-dm_plex_filename', 'of the run')} has {number(summary['reference_volume_ml'])} ml in "
-             f"{summary['cells']} tetrahedra; elements {summary['elements']}."]
-    areas = summary.get("surface_areas_mm2") or {}
-    lines += [f"Surface {name} has {number(area / 100)} cm²." for name, area in areas.items()]
-    lines += [f"{'Body' if r.get('connected_body') else 'Volume'} {name} has {number(r['reference_volume_ml'])} ml."
-              for name, r in (summary.get("regions") or {}).items()]
-    return lines
+def called(name):
+    return name.replace("_", " ").capitalize()
+
+
+def settings(effect):
+    """['porosity 0.99', 'c 0.3567 kPa']: an effect's options as the run used them, defaults included."""
+    return [" ".join(word for word in (s["name"], s["value"], pretty(s["unit"])) if word) for s in effect["settings"]]
 
 
 def build(run):
-    if not run.options:
-        raise Missing("A run writes its options when it ends, and this one has not ended: signals.csv.part alone does not say "
-                      "what the scene is.")
-    on = run.summary.get("effects") or []
-    off = [name for kind, name in options.table() if kind == "effect" and name not in on]
+    scene = run.scene
+    if not scene:
+        raise Missing("The directory has no scene.json, in which a run says what its scene is: an older version of pulmo made it.")
     try:
-        picture = pictures.lung(run)
+        picture, why = pictures.lung(run), ""
     except Missing as reason:
         picture, why = None, str(reason)
-    else:
-        why = ""
-    return {"mesh": mesh(run), "on": [sentence(run, effect) for effect in on],
-            "off": [(name.replace("_", " ").capitalize(), options.effect(name)) for name in off],
+    effects = scene["effects"]
+    return {"mesh": [pretty(line) for line in scene["mesh"]],
+            "on": [(called(e["name"]), "; ".join([e["words"], *settings(e)]) + ".") for e in effects if e["active"]],
+            "off": [(called(e["name"]), e["words"]) for e in effects if not e["active"]],
+            "more": [(title, [pretty(line) for line in scene[key]])
+                     for title, key in (("How far the tissue goes", "tissue_range"), ("How it breathes", "breathing"), ("How it is solved", "numerics"))
+                     if scene[key]],
             "file": os.path.basename(run.options.get("-dm_plex_filename", "")), "picture": picture, "why": why}

@@ -1,0 +1,159 @@
+"""From a segmented CT, or a mesh, to a page about a ventilated breath.
+
+  tools/breathe labels.nii.gz --volume 2500ml --mode vcv --tidal-volume 500 --peep 5
+  tools/breathe my.msh --mode pcv --pip 12 --effects supine,recruitment -- -tissue yoshihara
+  tools/breathe results/labels-vcv            # goes on with what an earlier call began
+
+Stages: mesh (made by tools/lung_mesh from a mask, checked if it is a file), dry run (the scene in words, memory and time),
+run, report. All of it goes into one folder, --case, which also holds the options, the files that they name, and versions, so that
+`run.sh` there does the run again. A call that was interrupted goes on where it stopped when it is given again. Options of pulmo follow
+after --; they count in the end.
+"""
+import argparse
+import os
+import shlex
+import sys
+from pathlib import Path
+
+from shared.common import SCENES, SOLVERS, SOURCE, fail, listed, offered
+from shared.keys import lock
+
+from . import stages
+from .case import Case
+
+NUMBERS = {"tidal_volume": "ml", "pip": "cmH2O", "peep": "cmH2O", "inspiration": "s", "expiration": "s", "breaths": ""}
+FOR_MASKS = ("volume", "size", "cells", "labels")  # options that go to tools/lung_mesh
+CELLS_FOR_A_RANK = 4000  # fewer cells are not worth a second process
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors are one sentence."""
+
+    def error(self, message):
+        self.exit(1, f"tools/breathe: error: {message}; see --help\n")
+
+
+def parse(words):
+    cut = words.index("--") if "--" in words else len(words)
+    parser = Parser(prog="tools/breathe", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("source", type=Path, metavar="MASK, MESH or CASE", help=(
+        "label image (.nii, .nii.gz), folder of label images, mesh (.msh), or the folder of an earlier call"))
+    parser.add_argument("--case", type=Path, metavar="DIR", help="folder for all of it (default: results/<name>-<mode>)")
+    parser.add_argument("--mode", default="pcv", help="a scene of petsc_options/scenes, as pcv, vcv, supersyringe, or an option file (default: pcv)")
+    for name, unit in NUMBERS.items():
+        parser.add_argument(f"--{name.replace('_', '-')}", metavar=unit.upper() or "N", help=f"-ventilator_{name} of pulmo{', ' + unit if unit else ''}")
+    parser.add_argument("--tissue", metavar="LAW", help="law of the tissue (default: the scene's)")
+    parser.add_argument("--effects", default="", metavar="NAME,...", help=(
+        "effects to add, by their names (pulmo -list), or pieces of scenes in petsc_options/scenes, as supine, obesity"))
+    parser.add_argument("--elements", choices=["P2-P1", "P1-P1"], help="P1-P1: a quarter of the time (default: P2-P1)")
+    parser.add_argument("--solver", default="iterative", help="a file of petsc_options/solvers (default: iterative)")
+    parser.add_argument("--within", metavar="NAME=1%", help=(
+        "look first for mesh, steps and elements that give a number to this accuracy (tools/accuracy_cost), and run with them"))
+    parser.add_argument("--budget", default="30min", help="time that this search may take (default: 30min)")
+    mask = parser.add_argument_group("of a mask (tools/lung_mesh)")
+    mask.add_argument("--volume", metavar="ML", help="volume of the lungs at rest, as 2500ml (default: the scan's)")
+    mask.add_argument("--size", metavar="MM", help="edge of the cells")
+    mask.add_argument("--cells", metavar="N", help="number of cells to aim at")
+    mask.add_argument("--labels", metavar="PART=NUMBER,...", help="what the labels are, as right=1,left=2,airway=3")
+    parser.add_argument("--ranks", type=int, help=f"processes (default: one for every {CELLS_FOR_A_RANK} cells, at most one for each core)")
+    parser.add_argument("--dry-run", action="store_true", help="stop after mesh and dry run")
+    parser.add_argument("--overwrite", action="store_true", help="replace what an earlier call with other words left in the folder")
+    parser.add_argument("--build", type=Path, default=SOURCE / "build", help="build folder (default: build)")
+    given = parser.parse_args(words[:cut])
+    given.flags = words[cut + 1:]
+    if given.ranks is not None and given.ranks < 1:
+        fail("--ranks must be at least 1")
+    return given
+
+
+def scene_file(name):
+    """The option file that --mode names."""
+    for path in (Path(name), SCENES / f"{name}.opts"):
+        if path.is_file():
+            return path
+    fail(f"--mode {name} is no option file, and no scene of petsc_options/scenes: {', '.join(sorted(p.stem for p in SCENES.glob('*.opts')))}")
+
+
+def scene_words(given):
+    """The words of the scene: mode, effects, numbers, pulmo's own options."""
+    words = ["-options_file", str(scene_file(given.mode))]
+    program = given.build / "pulmo"
+    for name in filter(None, given.effects.split(",")):
+        if (SCENES / f"{name}.opts").is_file():
+            words += ["-options_file", str(SCENES / f"{name}.opts")]
+        elif name in offered(program, "effect"):
+            words.append(f"-{name}")
+        else:
+            fail(f"--effects {name} is neither an effect ({', '.join(offered(program, 'effect'))}) nor a piece of a scene in petsc_options/scenes")
+    for name in NUMBERS:
+        if getattr(given, name) is not None:
+            words += [f"-ventilator_{name}", getattr(given, name)]
+    for option in ("tissue", "elements"):
+        if getattr(given, option):
+            words += [f"-{option}", getattr(given, option)]
+    return words + given.flags
+
+
+def solver_file(name):
+    for path in (Path(name), SOLVERS / f"{name}.opts"):
+        if path.is_file():
+            return path
+    fail(f"--solver {name} is no option file, and none of petsc_options/solvers: {', '.join(sorted(p.stem for p in SOLVERS.glob('*.opts')))}")
+
+
+def stem(path):
+    """'labels' of a/labels.nii.gz."""
+    name = path.resolve().name
+    return name[:name.index(".", 1)] if "." in name[1:] else name
+
+
+def begin(words):
+    """The case that the words of a call ask for, made or taken up again."""
+    given = parse(words)
+    if (given.source / "case.json").is_file():
+        case = Case(given.source)
+        more = [word for word in words if word not in (str(given.source), "--dry-run", "--overwrite") and word != os.fspath(given.source) + "/"]
+        if more:
+            fail(f"{given.source} is the folder of an earlier call, which goes on as it was called: leave out {' '.join(more)}, or give the mask or mesh again")
+        lock(case.folder)
+        return case, parse(case.call), given.dry_run
+    if not given.source.exists():
+        fail(f"there is no {given.source}: give a label image, a folder of them, a mesh (.msh) or the folder of an earlier call")
+    if not (given.build / "pulmo").exists():
+        fail(f"{given.build} holds no build; run tools/setup first")
+    is_mesh = given.source.suffix == ".msh"
+    if not is_mesh and not given.source.is_dir() and not given.source.name.endswith((".nii", ".nii.gz")):
+        fail(f"{given.source} is no label image (.nii, .nii.gz) and no mesh (.msh); tools/lung_mesh --convert makes one of other formats")
+    if is_mesh:
+        for option in FOR_MASKS:
+            if getattr(given, option):
+                fail(f"--{option} makes a mesh of a mask, and {given.source} is a mesh already: leave it out")
+    listed(given.build / "pulmo")  # before any folder is made
+    scene, solver = scene_words(given), solver_file(given.solver)
+    mode = given.mode if (SCENES / f"{given.mode}.opts").is_file() else stem(Path(given.mode))
+    folder = given.case or Path("results") / f"{stem(given.source)}-{mode}"
+    if folder.exists() and not (folder / "case.json").exists() and any(folder.iterdir()):
+        fail(f"--case {folder} holds other files: name a new folder")
+    lock(folder)
+    absolute = [str(given.source.resolve()) if word == str(given.source) else word for word in words if word not in ("--dry-run", "--overwrite")]
+    return Case.take(folder, absolute, scene, solver, given.overwrite), given, given.dry_run
+
+
+def main(words):
+    case, given, only_dry = begin(words)
+    print(f"breathe: all of it goes into {case.folder}", flush=True)
+    try:
+        stages.mesh(case, given)
+        if given.within:
+            stages.accuracy(case, given)
+        ranks = given.ranks or stages.ranks_for(case, CELLS_FOR_A_RANK)
+        stages.dry_run(case, given, ranks)
+        if only_dry:
+            print(f"breathe: that was the dry run; {shlex.join(['tools/breathe', str(case.folder)])} goes on")
+            return 0
+        code = stages.run(case, given, ranks)
+        stages.report(case)
+    except KeyboardInterrupt:
+        sys.exit(f"\nbreathe: interrupted; {shlex.join(['tools/breathe', str(case.folder)])} goes on from what is there")
+    stages.tell(case, code)
+    return code

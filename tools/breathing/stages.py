@@ -1,0 +1,177 @@
+"""The stages of a case: mesh, accuracy, dry run, run, report. Each is left out where it was done already."""
+import json
+import os
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+from shared.common import SOURCE, environment, fail
+
+from .progress import Progress
+
+PULMO_STOPPED = 3  # exit code: there is a checkpoint to go on from
+
+
+def say(text):
+    print(f"breathe: {text}", flush=True)
+
+
+def told(command, log, what):
+    """Runs a command, its words shown and kept; ends the program if it fails."""
+    with open(log, "w") as out:
+        process = subprocess.Popen([str(word) for word in command], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment())
+        for line in process.stdout:
+            out.write(line)
+            print("  " + line, end="", flush=True)
+    if process.wait():
+        fail(f"{what} failed, see above")
+
+
+def mesh(case, given):
+    """lung.msh in the case: made of the mask, or a copy of the mesh, checked."""
+    if "mesh" in case.done:
+        return
+    begun = time.monotonic()
+    to, log = case.folder / "lung.msh", case.folder / "mesh.txt"
+    tool = SOURCE / "tools/lung_mesh"
+    page = ["--report", case.folder / "mesh.html"]
+    if given.source.suffix == ".msh":
+        say(f"checking {given.source}")
+        check = subprocess.run([tool, "--check", given.source, *map(str, page)], capture_output=True, text=True, env=environment())
+        log.write_text(check.stdout + check.stderr)
+        print("".join(f"  {line}\n" for line in (check.stdout + check.stderr).splitlines()), end="")
+        if check.returncode:
+            say(f"the mesh would not pass as one of tools/lung_mesh (see above, and {log}); pulmo says itself what it cannot take")
+        shutil.copyfile(given.source, to)
+    else:
+        say(f"making a mesh of {given.source}")
+        more = [word for option in ("volume", "size", "cells", "labels") if getattr(given, option)
+                for word in (f"--{option}", getattr(given, option))]
+        told([tool, "--mask", given.source, "--output", to, *page, *more], log, "tools/lung_mesh")
+    case.save(mesh={"file": to.name, "seconds": round(time.monotonic() - begun, 1), "source": str(given.source)})
+
+
+def cells_of(case):
+    """Number of tetrahedra, as tools/lung_mesh told it."""
+    found = re.search(r"(\d+) tetrahedra|tetrahedra\s+(\d+)", (case.folder / "mesh.txt").read_text())
+    return int(found[1] or found[2]) if found else 0
+
+
+def ranks_for(case, cells_for_a_rank):
+    return max(1, min(len(os.sched_getaffinity(0)), cells_of(case) // cells_for_a_rank))
+
+
+def launched(given, ranks):
+    program = [str((given.build / "pulmo").resolve())]
+    return program if ranks == 1 else ["mpiexec", *(["--oversubscribe"] if ranks > len(os.sched_getaffinity(0)) else []), "-n", str(ranks), *program]
+
+
+def accuracy(case, given):
+    """accuracy.opts: mesh, steps and elements that give the number asked for, found by tools/accuracy_cost."""
+    if "accuracy" in case.done:
+        return
+    begun = time.monotonic()
+    say(f"looking for what gives {given.within}, in at most {given.budget}")
+    folder = case.folder / "accuracy"
+    command = [SOURCE / "tools/accuracy_cost", case.folder / "scene.opts", "--meshes", case.folder / "lung.msh", "--question", given.within,
+               "--budget", given.budget, "--build", given.build, "--output", folder, "--solvers", case.folder / "solver.opts"]
+    told(command, case.folder / "accuracy.txt", "tools/accuracy_cost")
+    recommended = sorted(folder.glob("recommended_*.opts"))
+    if not recommended:
+        say(f"no setting that was tried gives {given.within} for sure; the run goes on with the scene's own (see {folder / 'README.md'})")
+    else:
+        kept = [line for line in recommended[0].read_text().splitlines() if not line.startswith("-options_file")]
+        (case.folder / "accuracy.opts").write_text("\n".join(kept) + "\n")
+    case.save(accuracy={"seconds": round(time.monotonic() - begun, 1), "question": given.within, "found": bool(recommended)})
+
+
+def dry_run(case, given, ranks):
+    """The scene in words, what it takes; pulmo's checks. Ends the program if pulmo refuses it."""
+    inputs = case.inputs()
+    if case.done.get("dry_run", {}).get("inputs") == inputs:
+        return
+    begun = time.monotonic()
+    log = case.folder / "dry_run.txt"
+    run = subprocess.run([*launched(given, ranks), *case.options, "-dry_run"], cwd=case.folder, env=environment(), capture_output=True, text=True)
+    log.write_text(run.stdout + run.stderr)
+    print(run.stdout, end="")
+    if run.returncode:
+        sys.stderr.write(run.stderr)
+        sys.exit(run.returncode)
+    version = subprocess.run([given.build / "pulmo", "-version"], capture_output=True, text=True, env=environment()).stdout.strip()
+    case.save(dry_run={"seconds": round(time.monotonic() - begun, 1), "inputs": inputs, "version": version})
+
+
+def run(case, given, ranks):
+    """The run in run/; its exit code. One that was stopped goes on from its checkpoint."""
+    inputs, folder = case.inputs(), case.folder / "run"
+    if case.done.get("run", {}).get("code") == 0 and case.done["run"]["inputs"] == inputs and (folder / "summary.json").exists():
+        say("the run is there already")
+        return 0
+    begun = time.monotonic()
+    command = [*launched(given, ranks), *case.options, "-output_dir", "run"]
+    launcher = "pulmo" if ranks == 1 else f"mpiexec -n {ranks} pulmo"
+    script = case.folder / "run.sh"
+    script.write_text("#!/bin/sh\n# The run of this case again; pulmo must be in PATH.\ncd \"$(dirname \"$0\")\" &&\n"
+                      f"exec {launcher} {shlex.join(case.options)} -output_dir again \"$@\"\n")
+    script.chmod(0o755)
+    if (folder / "checkpoint.h5").exists() and case.done.get("run", {}).get("inputs") == inputs:
+        command += ["-restart", "run/checkpoint.h5"]
+        say("going on from the checkpoint")
+    else:
+        command.append("-output_overwrite")
+    case.save(run={"inputs": inputs, "code": None, "ranks": ranks})
+    code = execute(command, case)
+    case.save(run={"inputs": inputs, "code": code, "ranks": ranks, "seconds": round(time.monotonic() - begun, 1)})
+    if code == PULMO_STOPPED:
+        say(f"stopped; {shlex.join(['tools/breathe', str(case.folder)])} goes on from its checkpoint")
+    return code
+
+
+def execute(command, case):
+    """Runs pulmo with a bar; what it prints goes to pulmo.log. A signal is passed on, so that pulmo leaves a checkpoint."""
+    progress = Progress()
+    with open(case.folder / "pulmo.log", "a") as log:
+        process = subprocess.Popen(command, cwd=case.folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment(),
+                                   start_new_session=True)
+        former = {s: signal.signal(s, lambda number, _: process.send_signal(number)) for s in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            for line in process.stdout:
+                log.write(line)
+                log.flush()
+                progress.take(line)
+            return process.wait()
+        finally:
+            progress.end()
+            for s, handler in former.items():
+                signal.signal(s, handler)
+
+
+def report(case):
+    """The page about the run, also of one that failed; nothing where not even a row is there."""
+    folder = case.folder / "run"
+    if not any((folder / name).exists() for name in ("signals.csv", "signals.csv.part")):
+        return
+    begun = time.monotonic()
+    made = subprocess.run([SOURCE / "tools/report", folder, "--output", case.folder / "report.html"], capture_output=True, text=True, env=environment())
+    if made.returncode:
+        sys.stderr.write(made.stderr)
+        fail("tools/report failed, see above")
+    case.save(report={"seconds": round(time.monotonic() - begun, 1)})
+
+
+def tell(case, code):
+    """What is where, and how long the stages took."""
+    say("seconds: " + ", ".join(f"{name.replace('_', ' ')} {stage['seconds']:g}" for name, stage in case.done.items() if "seconds" in stage))
+    summary = case.folder / "run/summary.json"
+    if code == 0 and summary.exists():
+        numbers = json.loads(summary.read_text())
+        shown = [("tidal volume", "tidal_volume_ml", "ml"), ("peak pressure", "peak_pressure_cmH2O", "cmH2O"),
+                 ("compliance", "compliance_ml_per_cmH2O", "ml/cmH2O"), ("resistance", "resistance_cmH2O_s_per_l", "cmH2O s/l")]
+        say("; ".join(f"{words} {numbers[key]:.4g} {unit}" for words, key, unit in shown if isinstance(numbers.get(key), float)))
+    if (case.folder / "report.html").exists():
+        say(f"open {case.folder / 'report.html'} in a browser")
