@@ -197,12 +197,14 @@ PetscErrorCode DryRun::make(const Options &options, const Scene &scene, Simulati
   const double of_newton = begun.newton > 0 ? (s.residual + s.jacobian) / begun.newton : 0,
                of_krylov = begun.krylov > 0 ? s.solve / begun.krylov : 0, of_step = s.output / begun.steps,
                total = setup + whole.newton * of_newton + whole.krylov * of_krylov + whole.steps * of_step;
-  PetscCall(
-      PetscPrintf(comm,
-                  "  The run has about %.0f steps with %.0f Newton steps and %.0f Krylov iterations. It will take "
-                  "about %.3g s (%.3g to %.3g s)%s.\n",
-                  whole.steps, whole.newton, whole.krylov, total, (1 - uncertainty) * total, (1 + uncertainty) * total,
-                  finished ? ", as it just did" : ""));
+  if (finished)
+    PetscCall(PetscPrintf(comm, "  The run will take about %.3g s, as it just did.\n", total));
+  else
+    PetscCall(PetscPrintf(comm,
+                          "  The run has about %.0f steps with %.0f Newton steps and %.0f Krylov iterations. It will "
+                          "take about %.3g s (%.3g to %.3g s).\n",
+                          whole.steps, whole.newton, whole.krylov, total, (1 - uncertainty) * total,
+                          (1 + uncertainty) * total));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -4,7 +4,6 @@ import json
 import re
 import shlex
 import shutil
-import sys
 from pathlib import Path
 
 from shared.common import SOURCE, fail, written_whole
@@ -52,40 +51,68 @@ def found(value):
     return None
 
 
+def file_of(value):
+    """(file, rest) of a value that names a file as FILE or FILE:dataset; (None, value) else. A word without a dot or a slash is
+    a name, though a file may be called so."""
+    for name, rest in ((value, ""), (value.rpartition(":")[0], ":" + value.rpartition(":")[2])):
+        if re.search(r"[./]", name) and found(name):
+            return found(name), rest
+    return None, value
+
+
 def digest(path):
     with open(path, "rb") as f:
         return hashlib.file_digest(f, "sha256").hexdigest()
 
 
+def digest_of_source(path):
+    """Of a mask or a mesh; of a folder all files in it."""
+    if path.is_file():
+        return digest(path)
+    return hashlib.sha256("".join(f"{p.name} {digest(p)}\n" for p in sorted(path.iterdir()) if p.is_file()).encode()).hexdigest()
+
+
+def digest_of_options(pairs):
+    """Of options and of the files that they name."""
+    lines = [f"{name} {value} {digest(file_of(value)[0]) if file_of(value)[0] else ''}\n" for name, value in pairs]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
 class Case:
-    """`call`: the words that began it. `done`: what stages left to know, by their names."""
+    """`call`: the words that began it, `made_of`: hashes of what they named. `done`: what stages left to know, by their names."""
 
     def __init__(self, folder):
         self.folder = Path(folder)
         try:
-            self.known = json.loads((self.folder / "case.json").read_text())
-            self.call, self.done = self.known["call"], self.known["done"]
+            known = json.loads((self.folder / "case.json").read_text())
+            self.call, self.made_of, self.done = known["call"], known["made_of"], known["done"]
         except (ValueError, KeyError):
             fail(f"{self.folder / 'case.json'} is damaged; give the mask or mesh again with --overwrite")
 
     @classmethod
-    def take(cls, folder, call, scene, solver, overwrite):
-        """A new case, or that of an earlier call if it was called the same; else it is replaced only if it may be."""
-        if (folder / "case.json").exists():
-            if overwrite:
-                for path in folder.iterdir():
-                    if path.name != ".lock":
-                        shutil.rmtree(path) if path.is_dir() else path.unlink()
-            else:
-                case = cls(folder)
-                if case.call != call:
-                    fail(f"{folder} holds a case that was called otherwise ({shlex.join(case.call)}); name another --case, or --overwrite")
-                return case
+    def take(cls, folder, call, source, scene, solver, overwrite):
+        """A new case, or that of an earlier call if it was called the same with the same files; else it is replaced only if it may be.
+
+        scene: words of a command line. solver: an option file.
+        """
+        options = {"scene.opts": pairs_of(scene), "solver.opts": read_options(solver)}
+        made_of = {"source": digest_of_source(source)} | {name: digest_of_options(pairs) for name, pairs in options.items()}
+        if (folder / "case.json").exists() and not overwrite:
+            case = cls(folder)
+            if case.call != call:
+                fail(f"{folder} holds a case that was called otherwise ({shlex.join(case.call)}); name another --case, or --overwrite")
+            changed = [source if name == "source" else f"an option file of {name}" for name in made_of if made_of[name] != case.made_of.get(name)]
+            if changed:
+                fail(f"{changed[0]} has changed since {folder} was made of it; name another --case, or --overwrite")
+            return case
         folder.mkdir(parents=True, exist_ok=True)
+        for path in folder.iterdir():
+            if path.name != ".lock":
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
         case = cls.__new__(cls)
-        case.folder, case.call, case.done = folder, call, {}
-        case.write_options("scene.opts", pairs_of(scene), "the scene: mode, effects, numbers and options as called")
-        case.write_options("solver.opts", read_options(solver), f"the solver, {solver.name}")
+        case.folder, case.call, case.made_of, case.done = folder, call, made_of, {}
+        case.write_options("scene.opts", options["scene.opts"], "the scene: mode, effects, numbers and options as called")
+        case.write_options("solver.opts", options["solver.opts"], f"the solver, {solver.name}")
         case.save()
         return case
 
@@ -93,9 +120,7 @@ class Case:
         """An option file of the case. Files that options name are copied into inputs/, for the folder to be whole."""
         lines = [f"# {what}"]
         for option, value in pairs:
-            path, dataset = found(value), ""
-            if not path and ":" in value:
-                path, dataset = found(value.rpartition(":")[0]), ":" + value.rpartition(":")[2]
+            path, dataset = file_of(value)
             if path:
                 value = self.keep(path) + dataset
             quoted = f'"{value}"' if re.search(r"\s", value) or re.match(r"-[A-Za-z]", value) else value
@@ -118,7 +143,7 @@ class Case:
         """Notes what a stage left, whole or not at all."""
         self.done.update(done)
         with written_whole(str(self.folder / "case.json")) as part:
-            Path(part).write_text(json.dumps({"call": self.call, "done": self.done, "python": sys.version.split()[0]}, indent=2) + "\n")
+            Path(part).write_text(json.dumps({"call": self.call, "made_of": self.made_of, "done": self.done}, indent=2) + "\n")
 
     @property
     def options(self):

@@ -10,7 +10,6 @@ run, report. All of it goes into one folder, --case, which also holds the option
 after --; they count in the end.
 """
 import argparse
-import os
 import shlex
 import sys
 from pathlib import Path
@@ -112,7 +111,7 @@ def begin(words):
     given = parse(words)
     if (given.source / "case.json").is_file():
         case = Case(given.source)
-        more = [word for word in words if word not in (str(given.source), "--dry-run", "--overwrite") and word != os.fspath(given.source) + "/"]
+        more = [word for word in words if word != "--dry-run" and Path(word) != given.source]
         if more:
             fail(f"{given.source} is the folder of an earlier call, which goes on as it was called: leave out {' '.join(more)}, or give the mask or mesh again")
         lock(case.folder)
@@ -136,7 +135,7 @@ def begin(words):
         fail(f"--case {folder} holds other files: name a new folder")
     lock(folder)
     absolute = [str(given.source.resolve()) if word == str(given.source) else word for word in words if word not in ("--dry-run", "--overwrite")]
-    return Case.take(folder, absolute, scene, solver, given.overwrite), given, given.dry_run
+    return Case.take(folder, absolute, given.source, scene, solver, given.overwrite), given, given.dry_run
 
 
 def main(words):

@@ -99,8 +99,9 @@ def dry_run(case, given, ranks):
     run = subprocess.run([*launched(given, ranks), *case.options, "-dry_run"], cwd=case.folder, env=environment(), capture_output=True, text=True)
     log.write_text(run.stdout + run.stderr)
     print(run.stdout, end="")
-    if run.returncode:
-        sys.stderr.write(run.stderr)
+    if run.returncode:  # without what the launcher has to say
+        errors = [line for line in run.stderr.splitlines() if line.startswith("pulmo: error")]
+        print("\n".join(errors) or f"breathe: error: pulmo ended with code {run.returncode}; {log} has all that it said", file=sys.stderr)
         sys.exit(run.returncode)
     version = subprocess.run([given.build / "pulmo", "-version"], capture_output=True, text=True, env=environment()).stdout.strip()
     case.save(dry_run={"seconds": round(time.monotonic() - begun, 1), "inputs": inputs, "version": version})
@@ -114,12 +115,17 @@ def run(case, given, ranks):
         return 0
     begun = time.monotonic()
     command = [*launched(given, ranks), *case.options, "-output_dir", "run"]
+    before = case.done.get("run", {}).get("inputs")
+    if folder.exists() and before and before != inputs:
+        number = next(n for n in range(1, 10000) if not (case.folder / f"run_before_{n}").exists())
+        folder.rename(case.folder / f"run_before_{number}")
+        say(f"what the run reads has changed: its earlier results are in {case.folder / f'run_before_{number}'} now")
     launcher = "pulmo" if ranks == 1 else f"mpiexec -n {ranks} pulmo"
     script = case.folder / "run.sh"
     script.write_text("#!/bin/sh\n# The run of this case again; pulmo must be in PATH.\ncd \"$(dirname \"$0\")\" &&\n"
                       f"exec {launcher} {shlex.join(case.options)} -output_dir again \"$@\"\n")
     script.chmod(0o755)
-    if (folder / "checkpoint.h5").exists() and case.done.get("run", {}).get("inputs") == inputs:
+    if (folder / "checkpoint.h5").exists():
         command += ["-restart", "run/checkpoint.h5"]
         say("going on from the checkpoint")
     else:

@@ -1,0 +1,223 @@
+#!/usr/bin/python3
+"""tools/breathe: from a mask or a mesh to a page, again, interrupted, and with what users get wrong; -dry_run."""
+import csv
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import unittest
+from pathlib import Path
+
+import nibabel
+import numpy as np
+
+import pulmo_case as pulmo
+
+TOOL = os.path.join(pulmo.SOURCE, "tools/breathe")
+LUNG = os.path.join(pulmo.SOURCE, "meshes/lung_test.msh")
+BUILD = ["--build", os.path.dirname(pulmo.PROGRAM)]
+QUICK = ["--elements", "P1-P1", "--ranks", "1", *BUILD]
+STEPS = ["--", "-ts_dt", "0.1"]
+
+
+def called(*words, **more):
+    """A call in a folder of its own."""
+    return subprocess.run([TOOL, *map(str, words)], capture_output=True, text=True, timeout=300, env=pulmo.ENVIRONMENT,
+                          cwd=pulmo.scratch() if "cwd" not in more else more.pop("cwd"), **more)
+
+
+def rows(folder):
+    """Time and volume of a run's rows."""
+    with open(Path(folder) / "signals.csv") as f:
+        return [(float(row["time_s"]), float(row["volume_ml"])) for row in csv.DictReader(f)]
+
+
+def wait_for(condition, seconds=120):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it does not come"
+        time.sleep(0.02)
+
+
+class Mesh(unittest.TestCase):
+    """A mesh, weight and a programme of the user's own."""
+
+    @classmethod
+    def setUpClass(cls):
+        cls.place = Path(pulmo.scratch())
+        cls.place.mkdir(parents=True, exist_ok=True)
+        (cls.place / "bt").write_text("a file that is called like a line search\n")
+        (cls.place / "mine.txt").write_text("inspiration 0.6 pressure 5 ramp 0.1\nexpiration 1.4 pressure 0\n")
+        cls.words = [LUNG, "--mode", "programme", "--effects", "supine", "--case", "case", *QUICK, *STEPS,
+                     "-ventilator_programme", "mine.txt", "-snes_linesearch_type", "bt"]
+        cls.made = called(*cls.words, cwd=cls.place)
+        cls.case = cls.place / "case"
+
+    def test_the_run_is_that_of_its_options(self):
+        self.assertEqual(self.made.returncode, 0, self.made.stderr)
+        direct = pulmo.finished(["-dm_plex_filename", LUNG, "-options_file", os.path.join(pulmo.SOURCE, "petsc_options/scenes/programme.opts"),
+                                 "-options_file", os.path.join(pulmo.SOURCE, "petsc_options/scenes/supine.opts"), "-options_file",
+                                 os.path.join(pulmo.SOURCE, "petsc_options/solvers/iterative.opts"), "-elements", "P1-P1", "-ts_dt", "0.1",
+                                 "-ventilator_programme", str(self.place / "mine.txt")])
+        self.assertEqual(rows(self.case / "run"), rows(direct.directory))
+        said = f"tidal volume {direct.json()['tidal_volume_ml']:.4g} ml"
+        self.assertIn(said, self.made.stdout)
+
+    def test_the_folder_is_whole(self):
+        """It goes elsewhere, without the files that the call named, and run.sh does the same run."""
+        self.assertTrue((self.case / "report.html").stat().st_size > 10000)
+        self.assertIn("The mesh lung.msh has 1350 ml", (self.case / "dry_run.txt").read_text())
+        elsewhere = Path(pulmo.scratch()) / "moved"
+        shutil.copytree(self.case, elsewhere)
+        environment = dict(pulmo.ENVIRONMENT, PATH=os.path.dirname(pulmo.PROGRAM) + ":" + os.environ["PATH"])
+        again = subprocess.run([elsewhere / "run.sh", "-progress", "off"], capture_output=True, text=True, env=environment, cwd="/", timeout=300)
+        self.assertEqual(again.returncode, 0, again.stderr)
+        self.assertEqual(rows(elsewhere / "again"), rows(self.case / "run"))
+        self.assertNotIn(str(self.place), (self.case / "scene.opts").read_text())
+
+    def test_again_does_nothing_twice(self):
+        before = os.stat(self.case / "run/summary.json").st_mtime_ns
+        for words in (self.words, ["case"]):
+            again = called(*words, cwd=self.place)
+            self.assertEqual(again.returncode, 0, again.stderr)
+            self.assertIn("the run is there already", again.stdout)
+        self.assertEqual(os.stat(self.case / "run/summary.json").st_mtime_ns, before)
+
+    def test_what_changed_is_told(self):
+        place = Path(pulmo.scratch())
+        shutil.copytree(self.place, place)
+        (place / "mine.txt").write_text("inspiration 0.6 pressure 4 ramp 0.1\nexpiration 1.4 pressure 0\n")
+        shutil.copyfile(LUNG, place / "lung.msh")
+        for words, said in ((self.words, "has changed since"), ([*self.words, "-tissue", "ma"], "called otherwise")):
+            refused = called(*words, cwd=place)
+            self.assertEqual((refused.returncode, len(refused.stderr.splitlines())), (1, 1), refused.stderr)
+            self.assertIn(said, refused.stderr)
+        with open(place / "case/scene.opts", "a") as f:  # by hand
+            f.write("-tissue ma\n")
+        told = called("case", cwd=place)
+        self.assertEqual(told.returncode, 0, told.stderr)
+        self.assertEqual(json.loads((place / "case/run/summary.json").read_text())["tissue"], "ma")
+        self.assertEqual(rows(place / "case/run_before_1"), rows(self.case / "run"))
+
+    def test_interrupted_it_goes_on(self):
+        place = Path(pulmo.scratch())
+        place.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(self.place / "mine.txt", place / "mine.txt")
+        words = [word if word != "bt" else "basic" for word in self.words]
+        process = subprocess.Popen([TOOL, *words], cwd=place, env=pulmo.ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+                                   start_new_session=True)
+        signals = place / "case/run/signals.csv.part"
+        wait_for(lambda: signals.exists() and signals.read_text().count("\n") > 3)
+        os.killpg(process.pid, signal.SIGINT)
+        out = process.communicate(timeout=120)[0]
+        self.assertEqual(process.returncode, 3, out)
+        self.assertIn("goes on from its checkpoint", out)
+        gone_on = called("case", cwd=place)
+        self.assertEqual(gone_on.returncode, 0, gone_on.stderr)
+        self.assertIn("going on from the checkpoint", gone_on.stdout)
+        whole = rows(self.case / "run")
+        np.testing.assert_allclose(rows(place / "case/run"), whole, rtol=0, atol=1e-5 * max(v for _, v in whole))
+
+
+class Mask(unittest.TestCase):
+    def test_from_two_ellipsoids_to_a_page(self):
+        x = np.stack(np.meshgrid(*(np.arange(n) * 4.0 for n in (60, 40, 56)), indexing="ij"), axis=-1)
+        labels = np.zeros(x.shape[:-1], np.uint8)
+        half = np.array([40.0, 52.0, 80.0])
+        for label, middle in ((1, (178, 78, 110)), (2, (58, 78, 110))):  # x grows to the right of the body
+            labels[np.sum(((x - middle) / half) ** 2, axis=-1) < 1] = label
+        place = Path(pulmo.scratch())
+        place.mkdir(parents=True, exist_ok=True)
+        nibabel.save(nibabel.Nifti1Image(labels, np.diag([4.0, 4, 4, 1])), place / "two.nii.gz")
+        made = called("two.nii.gz", "--size", "24", "--mode", "vcv", "--tidal-volume", "300", *QUICK, *STEPS, cwd=place)
+        self.assertEqual(made.returncode, 0, made.stdout + made.stderr)
+        case = place / "results/two-vcv"
+        summary = json.loads((case / "run/summary.json").read_text())
+        self.assertAlmostEqual(summary["tidal_volume_ml"], 300, delta=0.3)
+        self.assertAlmostEqual(summary["reference_volume_ml"], 2 * 4 / 3 * np.pi * half.prod() / 1e3, delta=0.015 * summary["reference_volume_ml"])
+        self.assertAlmostEqual(summary["regions"]["left_lung"]["ventilation_share"], 0.5, delta=0.02)  # alike, so half each
+        self.assertTrue((case / "mesh.html").exists() and (case / "report.html").exists())
+
+
+class Mistakes(unittest.TestCase):
+    """One sentence that names it, exit code 1, nothing of the user's touched."""
+
+    def refused(self, *words, said, code=1, **more):
+        run = called(*words, **more)
+        self.assertEqual(run.returncode, code, run.stdout + run.stderr)
+        lines = [line for line in run.stderr.splitlines() if line.strip()]
+        self.assertEqual(len(lines), 1, run.stderr)
+        self.assertIn(said, lines[0])
+
+    def test_words(self):
+        for words, said in ((["none.msh"], "there is no none.msh"), ([LUNG, "--mode", "pvc"], "pcv"), ([LUNG, "--effects", "gravty"], "gravity"),
+                            ([LUNG, "--volume", "2500ml"], "--volume"), ([LUNG, "--ranks", "0"], "--ranks"), ([LUNG, "--solver", "x"], "iterative"),
+                            ([LUNG, "--pip"], "--pip"), ([__file__], "label image"), ([LUNG, "--build", "nowhere"], "tools/setup"),
+                            ([LUNG, "--", "tissue"], "belongs to no option"), ([LUNG, "--", "-options_file", "no.opts"], "no.opts")):
+            with self.subTest(words=words):
+                self.refused(*words, *([] if "--" in words or "--build" in words else BUILD), said=said)
+
+    def test_folders(self):
+        place = Path(pulmo.scratch())
+        (place / "full").mkdir(parents=True)
+        (place / "full/thesis.txt").write_text("mine")
+        (place / "broken").mkdir()
+        (place / "broken/case.json").write_text("{")
+        self.refused(LUNG, "--case", "full", *BUILD, said="holds other files", cwd=place)
+        self.refused("broken", said="damaged", cwd=place)
+        self.assertEqual((place / "full/thesis.txt").read_text(), "mine")
+
+    def test_what_pulmo_refuses(self):
+        """The sentence is pulmo's."""
+        self.refused(LUNG, *QUICK, "--", "-tisue", "ma", said="-tissue")
+        self.refused(LUNG, "--mode", "vcv", "--pip", "10", *QUICK, said="-ventilator_pip")
+
+    def test_an_empty_mask(self):
+        place = Path(pulmo.scratch())
+        place.mkdir(parents=True, exist_ok=True)
+        nibabel.save(nibabel.Nifti1Image(np.zeros((20, 20, 20), np.uint8), np.eye(4)), place / "empty.nii.gz")
+        run = called("empty.nii.gz", *QUICK, cwd=place)
+        self.assertEqual(run.returncode, 1)
+        self.assertIn("empty", run.stdout)
+        self.assertFalse((place / "results/empty-pcv/lung.msh").exists())
+
+
+class DryRun(unittest.TestCase):
+    SCENE = pulmo.DIRECT + pulmo.PCV + pulmo.LUNG + ["-ts_dt", "0.1"]
+
+    def foreseen(self, *more):
+        case = pulmo.Case([*self.SCENE, "-dry_run", *more])
+        self.assertEqual(case.code, 0, case.tail())
+        self.assertFalse(os.path.exists(case.directory) and os.listdir(case.directory))
+        return case.out
+
+    def test_steps_and_iterations_are_foreseen(self):
+        """From the first steps (a short time) and the rehearsal with P1-P1 elements; of the run itself nothing is known."""
+        said = self.foreseen("-dry_run_seconds", "0.01")
+        told = self.foreseen("-dry_run_seconds", "1000", "-elements", "P1-P1")
+        run = pulmo.finished(self.SCENE).json()
+        steps, newton, krylov = map(int, re.search(r"about (\d+) steps with (\d+) Newton steps and (\d+) Krylov", said).groups())
+        self.assertEqual(steps, run["steps"])
+        self.assertGreater(newton, 0.4 * run["newton_iterations"])
+        self.assertIn("as it just did", told)
+
+    def test_a_whole_rehearsal_is_nearer(self):
+        said = self.foreseen("-dry_run_seconds", "3")
+        run = pulmo.finished(self.SCENE).json()
+        newton = int(re.search(r"with (\d+) Newton", said.rpartition("The run has about")[2])[1])
+        self.assertLess(abs(newton / run["newton_iterations"] - 1), 0.3)
+        self.assertIn(f"{run['dofs']} unknowns", said)
+
+    def test_it_refuses_what_the_run_refuses(self):
+        for more, said in ((["-tisue", "ma"], "-tissue"), (["-restart", "x.h5"], "x.h5")):
+            case = pulmo.Case([*self.SCENE, "-dry_run", *more])
+            self.assertEqual(case.code, 1, case.tail())
+            self.assertIn(said, case.err)
+
+
+if __name__ == "__main__":
+    pulmo.main()
