@@ -24,10 +24,16 @@ QUICK = ["--elements", "P1-P1", "--ranks", "1", *BUILD]
 STEPS = ["--", "-ts_dt", "0.1"]
 
 
-def called(*words, **more):
-    """A call in a folder of its own."""
-    return subprocess.run([TOOL, *map(str, words)], capture_output=True, text=True, timeout=300, env=pulmo.ENVIRONMENT,
-                          cwd=pulmo.scratch() if "cwd" not in more else more.pop("cwd"), **more)
+def folder():
+    """An empty one."""
+    path = Path(pulmo.scratch())
+    path.mkdir(parents=True)
+    return path
+
+
+def called(*words, cwd=None):
+    """A call, in a folder of its own unless one is named."""
+    return subprocess.run([TOOL, *map(str, words)], capture_output=True, text=True, timeout=300, env=pulmo.ENVIRONMENT, cwd=cwd or folder())
 
 
 def rows(folder):
@@ -48,8 +54,7 @@ class Mesh(unittest.TestCase):
 
     @classmethod
     def setUpClass(cls):
-        cls.place = Path(pulmo.scratch())
-        cls.place.mkdir(parents=True, exist_ok=True)
+        cls.place = folder()
         (cls.place / "bt").write_text("a file that is called like a line search\n")
         (cls.place / "mine.txt").write_text("inspiration 0.6 pressure 5 ramp 0.1\nexpiration 1.4 pressure 0\n")
         cls.words = [LUNG, "--mode", "programme", "--effects", "supine", "--case", "case", *QUICK, *STEPS,
@@ -77,7 +82,7 @@ class Mesh(unittest.TestCase):
         again = subprocess.run([elsewhere / "run.sh", "-progress", "off"], capture_output=True, text=True, env=environment, cwd="/", timeout=300)
         self.assertEqual(again.returncode, 0, again.stderr)
         self.assertEqual(rows(elsewhere / "again"), rows(self.case / "run"))
-        self.assertNotIn(str(self.place), (self.case / "scene.opts").read_text())
+        self.assertNotIn(str(self.place), (self.case / "own.opts").read_text())
 
     def test_again_does_nothing_twice(self):
         before = os.stat(self.case / "run/summary.json").st_mtime_ns
@@ -96,7 +101,7 @@ class Mesh(unittest.TestCase):
             refused = called(*words, cwd=place)
             self.assertEqual((refused.returncode, len(refused.stderr.splitlines())), (1, 1), refused.stderr)
             self.assertIn(said, refused.stderr)
-        with open(place / "case/scene.opts", "a") as f:  # by hand
+        with open(place / "case/own.opts", "a") as f:  # by hand
             f.write("-tissue ma\n")
         told = called("case", cwd=place)
         self.assertEqual(told.returncode, 0, told.stderr)
@@ -104,8 +109,7 @@ class Mesh(unittest.TestCase):
         self.assertEqual(rows(place / "case/run_before_1"), rows(self.case / "run"))
 
     def test_interrupted_it_goes_on(self):
-        place = Path(pulmo.scratch())
-        place.mkdir(parents=True, exist_ok=True)
+        place = folder()
         shutil.copyfile(self.place / "mine.txt", place / "mine.txt")
         words = [word if word != "bt" else "basic" for word in self.words]
         process = subprocess.Popen([TOOL, *words], cwd=place, env=pulmo.ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
@@ -130,8 +134,7 @@ class Mask(unittest.TestCase):
         half = np.array([40.0, 52.0, 80.0])
         for label, middle in ((1, (178, 78, 110)), (2, (58, 78, 110))):  # x grows to the right of the body
             labels[np.sum(((x - middle) / half) ** 2, axis=-1) < 1] = label
-        place = Path(pulmo.scratch())
-        place.mkdir(parents=True, exist_ok=True)
+        place = folder()
         nibabel.save(nibabel.Nifti1Image(labels, np.diag([4.0, 4, 4, 1])), place / "two.nii.gz")
         made = called("two.nii.gz", "--size", "24", "--mode", "vcv", "--tidal-volume", "300", *QUICK, *STEPS, cwd=place)
         self.assertEqual(made.returncode, 0, made.stdout + made.stderr)
@@ -162,8 +165,8 @@ class Mistakes(unittest.TestCase):
                 self.refused(*words, *([] if "--" in words or "--build" in words else BUILD), said=said)
 
     def test_folders(self):
-        place = Path(pulmo.scratch())
-        (place / "full").mkdir(parents=True)
+        place = folder()
+        (place / "full").mkdir()
         (place / "full/thesis.txt").write_text("mine")
         (place / "broken").mkdir()
         (place / "broken/case.json").write_text("{")
@@ -177,8 +180,7 @@ class Mistakes(unittest.TestCase):
         self.refused(LUNG, "--mode", "vcv", "--pip", "10", *QUICK, said="-ventilator_pip")
 
     def test_an_empty_mask(self):
-        place = Path(pulmo.scratch())
-        place.mkdir(parents=True, exist_ok=True)
+        place = folder()
         nibabel.save(nibabel.Nifti1Image(np.zeros((20, 20, 20), np.uint8), np.eye(4)), place / "empty.nii.gz")
         run = called("empty.nii.gz", *QUICK, cwd=place)
         self.assertEqual(run.returncode, 1)

@@ -9,6 +9,7 @@ from pathlib import Path
 from shared.common import SOURCE, fail, written_whole
 
 OPTION_FILE = "-options_file"
+OPTION_FILES = {"scene": "the scene: mode and effects", "solver": "the solver", "own": "numbers and options of the call, which override what stands before"}
 
 
 def read_options(path):
@@ -90,18 +91,18 @@ class Case:
             fail(f"{self.folder / 'case.json'} is damaged; give the mask or mesh again with --overwrite")
 
     @classmethod
-    def take(cls, folder, call, source, scene, solver, overwrite):
+    def take(cls, folder, call, source, words, overwrite):
         """A new case, or that of an earlier call if it was called the same with the same files; else it is replaced only if it may be.
 
-        scene: words of a command line. solver: an option file.
+        words: of a command line, for each of OPTION_FILES.
         """
-        options = {"scene.opts": pairs_of(scene), "solver.opts": read_options(solver)}
+        options = {name: pairs_of(words[name]) for name in OPTION_FILES}
         made_of = {"source": digest_of_source(source)} | {name: digest_of_options(pairs) for name, pairs in options.items()}
         if (folder / "case.json").exists() and not overwrite:
             case = cls(folder)
             if case.call != call:
                 fail(f"{folder} holds a case that was called otherwise ({shlex.join(case.call)}); name another --case, or --overwrite")
-            changed = [source if name == "source" else f"an option file of {name}" for name in made_of if made_of[name] != case.made_of.get(name)]
+            changed = [source if name == "source" else f"a file that {name}.opts was made of" for name in made_of if made_of[name] != case.made_of.get(name)]
             if changed:
                 fail(f"{changed[0]} has changed since {folder} was made of it; name another --case, or --overwrite")
             return case
@@ -111,8 +112,8 @@ class Case:
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
         case = cls.__new__(cls)
         case.folder, case.call, case.made_of, case.done = folder, call, made_of, {}
-        case.write_options("scene.opts", options["scene.opts"], "the scene: mode, effects, numbers and options as called")
-        case.write_options("solver.opts", options["solver.opts"], f"the solver, {solver.name}")
+        for name, what in OPTION_FILES.items():
+            case.write_options(f"{name}.opts", options[name], what)
         case.save()
         return case
 
@@ -148,11 +149,10 @@ class Case:
     @property
     def options(self):
         """What pulmo is told in this folder, without launcher and output."""
-        more = ["-options_file", "accuracy.opts"] if (self.folder / "accuracy.opts").exists() else []
-        return ["-dm_plex_filename", self.done["mesh"]["file"], "-options_file", "scene.opts", "-options_file", "solver.opts", *more]
+        files = [f"{name}.opts" for name in (*OPTION_FILES, "accuracy") if (self.folder / f"{name}.opts").exists()]
+        return ["-dm_plex_filename", self.done["mesh"]["file"], *(word for name in files for word in (OPTION_FILE, name))]
 
     def inputs(self):
         """Hashes of all that a run reads: what changes any of them makes another run."""
-        names = ["scene.opts", "solver.opts", "accuracy.opts", self.done["mesh"]["file"]]
-        names += [str(p.relative_to(self.folder)) for p in sorted(self.folder.glob("inputs/*"))]
-        return {name: digest(self.folder / name) for name in names if (self.folder / name).exists()}
+        files = [self.folder / self.done["mesh"]["file"], *sorted(self.folder.glob("*.opts")), *sorted(self.folder.glob("inputs/*"))]
+        return {str(path.relative_to(self.folder)): digest(path) for path in files}

@@ -74,7 +74,7 @@ def scene_file(name):
 
 
 def scene_words(given):
-    """The words of the scene: mode, effects, numbers, pulmo's own options."""
+    """The words of the scene: mode and effects."""
     words = ["-options_file", str(scene_file(given.mode))]
     program = given.build / "pulmo"
     for name in filter(None, given.effects.split(",")):
@@ -84,6 +84,12 @@ def scene_words(given):
             words.append(f"-{name}")
         else:
             fail(f"--effects {name} is neither an effect ({', '.join(offered(program, 'effect'))}) nor a piece of a scene in petsc_options/scenes")
+    return words
+
+
+def own_words(given):
+    """What overrides scene and solver: numbers, law, elements, pulmo's own options."""
+    words = []
     for name in NUMBERS:
         if getattr(given, name) is not None:
             words += [f"-ventilator_{name}", getattr(given, name)]
@@ -128,14 +134,14 @@ def begin(words):
             if getattr(given, option):
                 fail(f"--{option} makes a mesh of a mask, and {given.source} is a mesh already: leave it out")
     listed(given.build / "pulmo")  # before any folder is made
-    scene, solver = scene_words(given), solver_file(given.solver)
+    words_of = {"scene": scene_words(given), "solver": ["-options_file", str(solver_file(given.solver))], "own": own_words(given)}
     mode = given.mode if (SCENES / f"{given.mode}.opts").is_file() else stem(Path(given.mode))
     folder = given.case or Path("results") / f"{stem(given.source)}-{mode}"
     if folder.exists() and not (folder / "case.json").exists() and any(folder.iterdir()):
         fail(f"--case {folder} holds other files: name a new folder")
     lock(folder)
     absolute = [str(given.source.resolve()) if word == str(given.source) else word for word in words if word not in ("--dry-run", "--overwrite")]
-    return Case.take(folder, absolute, given.source, scene, solver, given.overwrite), given, given.dry_run
+    return Case.take(folder, absolute, given.source, words_of, given.overwrite), given, given.dry_run
 
 
 def main(words):

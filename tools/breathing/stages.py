@@ -20,10 +20,10 @@ def say(text):
     print(f"breathe: {text}", flush=True)
 
 
-def told(command, log, what):
+def told(command, log, what, **place):
     """Runs a command, its words shown and kept; ends the program if it fails."""
     with open(log, "w") as out:
-        process = subprocess.Popen([str(word) for word in command], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment())
+        process = subprocess.Popen([str(word) for word in command], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment(), **place)
         for line in process.stdout:
             out.write(line)
             print("  " + line, end="", flush=True)
@@ -77,9 +77,9 @@ def accuracy(case, given):
     begun = time.monotonic()
     say(f"looking for what gives {given.within}, in at most {given.budget}")
     folder = case.folder / "accuracy"
-    command = [SOURCE / "tools/accuracy_cost", case.folder / "scene.opts", "--meshes", case.folder / "lung.msh", "--question", given.within,
-               "--budget", given.budget, "--build", given.build, "--output", folder, "--solvers", case.folder / "solver.opts"]
-    told(command, case.folder / "accuracy.txt", "tools/accuracy_cost")
+    command = [SOURCE / "tools/accuracy_cost", "scene.opts", "--meshes", case.done["mesh"]["file"], "--question", given.within, "--budget", given.budget,
+               "--build", given.build.resolve(), "--output", "accuracy", "--solvers", "solver.opts", "--", "-options_file", "own.opts"]
+    told(command, case.folder / "accuracy.txt", "tools/accuracy_cost", cwd=case.folder)
     recommended = sorted(folder.glob("recommended_*.opts"))
     if not recommended:
         say(f"no setting that was tried gives {given.within} for sure; the run goes on with the scene's own (see {folder / 'README.md'})")

@@ -31,6 +31,28 @@ def png(figure, dpi=100):
     return "data:image/png;base64," + base64.b64encode(out.getvalue()).decode()
 
 
+def box_of(corners):
+    """(middle, half of the longest side) of places (..., 3): what a picture has to show."""
+    corners = corners.reshape(-1, 3)
+    return (corners.max(0) + corners.min(0)) / 2, np.ptp(corners, axis=0).max() / 2
+
+
+def shaded(axes, corners, colours, azimuth, box):
+    """Draws triangles (n, 3, 3), mm, lit from where one stands; colours (n, 3). box: as of box_of()."""
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-30)[:, None]
+    towards = np.array([np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth)), 0.3])
+    light = 0.35 + 0.65 * np.clip(normals @ (towards / np.linalg.norm(towards)), 0, 1)
+    faces = colours * light[:, None]
+    axes.add_collection3d(Poly3DCollection(corners, facecolors=faces, edgecolors=faces, linewidths=0.2))
+    middle, half = box
+    for set_limit, m in zip((axes.set_xlim, axes.set_ylim, axes.set_zlim), middle):
+        set_limit(m - half, m + half)
+    axes.set_box_aspect((1, 1, 1), zoom=1.35)
+    axes.view_init(elev=12, azim=azimuth)
+    axes.set_axis_off()
+
+
 def lung(run):
     """The lung at rest as seen from the front and the side, coloured by region: (image, alt text); raises Missing."""
     fields = run.fields
@@ -39,23 +61,12 @@ def lung(run):
     region = np.zeros(len(cells), int) if numbers is None else numbers[cells].astype(int)
     names = {entry.get("number"): name for name, entry in (run.summary.get("regions") or {}).items()}
     corners = fields.points[triangles]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-30)[:, None]
     present = sorted(set(region))
     colour = {n: np.array(matplotlib.colors.to_rgb(REGION_COLOURS[i % len(REGION_COLOURS)])) for i, n in enumerate(present)}
     figure = plt.figure(figsize=(7, 3.6))
-    middle, half = (corners.max((0, 1)) + corners.min((0, 1))) / 2, np.ptp(corners.reshape(-1, 3), axis=0).max() / 2
     for place, (title, azimuth) in enumerate((("from the front", 90), ("from the right", 0))):
         axes = figure.add_subplot(1, 2, place + 1, projection="3d", proj_type="ortho")
-        towards = np.array([np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth)), 0.3])
-        light = 0.35 + 0.65 * np.clip(normals @ (towards / np.linalg.norm(towards)), 0, 1)
-        faces = np.array([colour[n] for n in region]) * light[:, None]
-        axes.add_collection3d(Poly3DCollection(corners, facecolors=faces, edgecolors=faces, linewidths=0.2))
-        for set_limit, m in zip((axes.set_xlim, axes.set_ylim, axes.set_zlim), middle):
-            set_limit(m - half, m + half)
-        axes.set_box_aspect((1, 1, 1), zoom=1.35)
-        axes.view_init(elev=12, azim=azimuth)
-        axes.set_axis_off()
+        shaded(axes, corners, np.array([colour[n] for n in region]), azimuth, box_of(corners))
         figure.text(0.25 + 0.5 * place, 0.01, title, ha="center", fontsize=10)
     if len(present) > 1:
         handles = [plt.Line2D([], [], marker="s", ls="", color=colour[n], label=names.get(n, f"region {n}")) for n in present]
