@@ -6,6 +6,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <sys/resource.h>
 
 namespace pulmo {
@@ -15,7 +16,8 @@ namespace {
 /// The elements of the rehearsal: their Newton steps cost a tenth of those of P2-P1.
 constexpr const char *cheapest = "P1-P1";
 
-/// Share of the seconds that the first steps may take where a rehearsal follows.
+/// Where a rehearsal follows, so many first steps tell what an iteration costs, or those of this share of the seconds.
+constexpr std::size_t first_steps = 3;
 constexpr double share_of_first_steps = 0.4;
 
 /// What is foreseen is as wrong as this, found on scenes and meshes of docs/running.md.
@@ -38,11 +40,12 @@ Work work_of(const std::vector<SignalRow> &rows, std::size_t steps)
   return work;
 }
 
-/// Ends a run after some seconds, but not before a step had something to solve.
+/// Ends a run after some seconds or steps, but not before a step had something to solve.
 class Budget final : public StopRequest {
 public:
-  Budget(MPI_Comm comm, const Simulation &simulation, double seconds)
-      : comm_(comm), simulation_(simulation), seconds_(seconds)
+  Budget(MPI_Comm comm, const Simulation &simulation, double seconds,
+         std::size_t steps = std::numeric_limits<std::size_t>::max())
+      : comm_(comm), simulation_(simulation), seconds_(seconds), steps_(steps)
   {
     (void)PetscTime(&start_);
   }
@@ -54,10 +57,10 @@ public:
   }
   PetscErrorCode asked(bool &stop) override
   {
-    int over = 0;
+    const std::vector<SignalRow> &rows = simulation_.rows();
+    int over = (spent() > seconds_ || rows.size() > steps_) && work_of(rows, rows.size()).newton > 0;
 
     PetscFunctionBeginUser;
-    over = spent() > seconds_ && work_of(simulation_.rows(), simulation_.rows().size()).newton > 0;
     PetscCallMPI(MPI_Bcast(&over, 1, MPI_INT, 0, comm_));
     stop = over != 0;
     PetscFunctionReturn(PETSC_SUCCESS);
@@ -67,6 +70,7 @@ private:
   MPI_Comm comm_;
   const Simulation &simulation_;
   double seconds_;
+  std::size_t steps_;
   PetscLogDouble start_ = 0;
 };
 
@@ -155,7 +159,8 @@ PetscErrorCode DryRun::make(const Options &options, const Scene &scene, Simulati
   PetscCall(VecGetSize(simulation.state(), &dofs));
   PetscCallMPI(MPI_Comm_size(comm, &ranks));
   PetscCall(PetscPrintf(comm, "Dry run\n  solving the first steps ...\n"));
-  Budget first(comm, simulation, (rehearse ? share_of_first_steps : 1) * seconds_);
+  Budget first = rehearse ? Budget(comm, simulation, share_of_first_steps * seconds_, first_steps)
+                          : Budget(comm, simulation, seconds_);
   simulation.heed(first);
   PetscCall(simulation.run(finished));
   const double first_took = first.spent(), setup = simulation.seconds().setup;
