@@ -327,6 +327,7 @@ GivenOptions read_options(const std::vector<std::string> &words, const Surroundi
   }
   if (given.fault.empty()) given.fault = reader.command_line(words);
   if (given.fault.empty()) given.fault = reader.end();
+  if (words.empty() && given.fault.empty() && given.list.empty()) given.question = "usage";
   return given;
 }
 

@@ -7,6 +7,7 @@
 //
 // mpiexec -n N pulmo -dm_plex_filename LUNG.msh -options_file SCENE.opts -options_file SOLVER.opts ...
 #include "pulmo/input/command_line.hpp"
+#include "pulmo/program/usage.hpp"
 #include "pulmo/pulmo.hpp"
 
 #include <csignal>
@@ -92,6 +93,20 @@ void print_list(const pulmo::Registry &registry)
   for (const auto &effect : registry.make_effects()) print("example", effect->name(), effect->example().c_str());
 }
 
+/// Says what was asked for, or what is wrong.
+void answer(const pulmo::GivenOptions &given, const char *called)
+{
+  if (given.question == "version")
+    std::printf("pulmo %s (PETSc %d.%d.%d)\n", pulmo::version(), PETSC_VERSION_MAJOR, PETSC_VERSION_MINOR,
+                PETSC_VERSION_SUBMINOR);
+  else if (given.question == "list")
+    print_list(pulmo::Registry::standard());
+  else if (given.question == "usage")
+    std::fputs(pulmo::usage(called).c_str(), stderr);
+  else
+    std::fprintf(stderr, "pulmo: error: %s\n", given.fault.c_str());
+}
+
 /// Makes what rank 0 has known to all ranks.
 void share(std::string &text)
 {
@@ -156,15 +171,9 @@ int main(int argc, char **argv)
   share(packed);
   const pulmo::GivenOptions given = pulmo::GivenOptions::unpacked(packed);
   if (!given.question.empty() || !given.fault.empty()) {
-    if (rank == 0 && given.question == "version")
-      std::printf("pulmo %s (PETSc %d.%d.%d)\n", pulmo::version(), PETSC_VERSION_MAJOR, PETSC_VERSION_MINOR,
-                  PETSC_VERSION_SUBMINOR);
-    else if (rank == 0 && given.question == "list")
-      print_list(pulmo::Registry::standard());
-    else if (rank == 0)
-      std::fprintf(stderr, "pulmo: error: %s\n", given.fault.c_str());
+    if (rank == 0) answer(given, argv[0]);
     MPI_Finalize();
-    return given.question.empty() ? PULMO_WRONG_INPUT : PULMO_FINISHED;
+    return given.question == "version" || given.question == "list" ? PULMO_FINISHED : PULMO_WRONG_INPUT;
   }
   pulmo::OptionList sources;
   PetscErrorCode code = hand_over(given, sources);

@@ -330,6 +330,29 @@ class Sources(unittest.TestCase):
             self.refused(pulmo.Case([flag, stray], directory="-", cwd=self.work), f"-{flag.strip('-')} stands alone")
         self.assertNotIn("results", os.listdir(self.work))
 
+    def test_without_a_word_pulmo_tells_how_it_is_called(self):
+        """By an example that runs as it stands, wherever one is; code 1, so that a script sees what it forgot."""
+        folder = pulmo.scratch("anywhere")
+        os.mkdir(folder)
+        for ranks in 1, 2:
+            case = pulmo.Case([], ranks=ranks, directory="-", cwd=folder)
+            self.assertEqual((case.code, case.out), (1, ""), case.tail())
+            self.assertEqual(case.err.count("usage: "), 1, case.tail())
+        for where in folder, pulmo.SOURCE:
+            said = pulmo.Case([], directory="-", cwd=where).err
+            example = re.search(r"\n\n  (.*?)\n\n", said, re.S).group(1)
+            self.assertIn(" meshes/lung_test.msh" if where == pulmo.SOURCE else f" {pulmo.SOURCE}/meshes/lung_test.msh", example)
+            run = subprocess.run(example.replace("-output_dir first_breath", f"-output_dir {folder}/run -output_overwrite -ts_max_time 0.05"),
+                                 shell=True, cwd=where, env=pulmo.alone(), capture_output=True, text=True)
+            self.assertEqual(run.returncode, 0, run.stderr)
+            self.assertIn("summary.json", os.listdir(os.path.join(folder, "run")))
+        for given in dict(options=["-options_file", self.file("# none")]), dict(options=[], PETSC_OPTIONS="-tissue ma"):
+            self.assertIn("no mesh", self.run_bare(folder, **given).stderr)
+
+    def run_bare(self, folder, options, **environment):
+        return subprocess.run([pulmo.PROGRAM, *options], cwd=folder, env=pulmo.alone() | dict(HOME=self.home) | environment,
+                              capture_output=True, text=True)
+
 
 if __name__ == "__main__":
     pulmo.main()

@@ -30,7 +30,7 @@ struct GivenOptions {
   std::vector<GivenOption> list;
   std::string fault;                ///< what is wrong, in a sentence that tells how to fix it; empty: nothing
   std::vector<std::string> unasked; ///< sources that the command line does not name
-  std::string question;             ///< "version" or "list": only that is asked for; empty: a run
+  std::string question;             ///< "version", "list", or "usage" if nothing is given; empty: a run
 
   /// As one string, to be sent to the other ranks, and back.
   std::string packed() const;
