@@ -1,5 +1,5 @@
-# cmake --install: program, library with its CMake package, tools, docs. Tools find meshes and option files beside
-# them, as in the source tree.
+# cmake --install: program, library with its CMake package and its file for pkg-config, tools, docs, manual page. Tools find
+# meshes and option files beside them, as in the source tree. Two components: `program`, and `development` for the library.
 include(CMakePackageConfigHelpers)
 set(package ${CMAKE_INSTALL_LIBDIR}/cmake/pulmo)
 set(data ${CMAKE_INSTALL_DATADIR}/pulmo)
@@ -9,7 +9,7 @@ file(RELATIVE_PATH to_libraries ${CMAKE_INSTALL_FULL_BINDIR} ${CMAKE_INSTALL_FUL
 set_target_properties(pulmo pulmo_library PROPERTIES INSTALL_RPATH_USE_LINK_PATH ON)
 set_target_properties(pulmo PROPERTIES INSTALL_RPATH "$ORIGIN/${to_libraries}")
 
-install(TARGETS pulmo RUNTIME)
+set(CMAKE_INSTALL_DEFAULT_COMPONENT_NAME development)
 install(TARGETS pulmo_library EXPORT pulmo)
 install(EXPORT pulmo FILE pulmo-targets.cmake NAMESPACE pulmo:: DESTINATION ${package})
 configure_package_config_file(${CMAKE_CURRENT_LIST_DIR}/pulmo-config.cmake.in ${PROJECT_BINARY_DIR}/pulmo-config.cmake
@@ -20,6 +20,17 @@ install(FILES ${PROJECT_BINARY_DIR}/pulmo-config.cmake ${PROJECT_BINARY_DIR}/pul
         DESTINATION ${package})
 install(DIRECTORY include/pulmo DESTINATION ${CMAKE_INSTALL_INCLUDEDIR})
 
+# for projects without CMake; what PETSc needs is in PETSc's own file
+set(modules ${CMAKE_INSTALL_FULL_LIBDIR}/pkgconfig)
+file(RELATIVE_PATH PULMO_TO_PREFIX ${modules} ${CMAKE_INSTALL_PREFIX})
+list(TRANSFORM MPI_CXX_INCLUDE_DIRS PREPEND -I OUTPUT_VARIABLE PULMO_MPI_FLAGS)
+list(JOIN PULMO_MPI_FLAGS " " PULMO_MPI_FLAGS)
+list(JOIN MPI_CXX_LIBRARIES " " PULMO_MPI_LIBRARIES)
+configure_file(${CMAKE_CURRENT_LIST_DIR}/pulmo.pc.in ${PROJECT_BINARY_DIR}/pulmo.pc @ONLY)
+install(FILES ${PROJECT_BINARY_DIR}/pulmo.pc DESTINATION ${CMAKE_INSTALL_LIBDIR}/pkgconfig)
+
+set(CMAKE_INSTALL_DEFAULT_COMPONENT_NAME program)
+install(TARGETS pulmo RUNTIME)
 install(DIRECTORY petsc_options meshes DESTINATION ${data})
 install(PROGRAMS tools/report tools/lung_mesh tools/sphere_mesh tools/cell_values tools/accuracy_cost tools/reproduce_paper
         DESTINATION ${data}/tools)
@@ -29,7 +40,21 @@ install(DIRECTORY tools/reports/templates DESTINATION ${data}/tools/reports)
 install(FILES docs/paper/page.md.in DESTINATION ${data}/docs/paper)
 # the tools' build/pulmo is the installed program
 file(RELATIVE_PATH to_program ${CMAKE_INSTALL_FULL_DATADIR}/pulmo ${CMAKE_INSTALL_FULL_BINDIR})
-install(CODE "file(CREATE_LINK \"${to_program}\" \"\$ENV{DESTDIR}\${CMAKE_INSTALL_PREFIX}/${data}/build\" SYMBOLIC)")
+install(CODE "file(CREATE_LINK \"${to_program}\" \"\$ENV{DESTDIR}\${CMAKE_INSTALL_PREFIX}/${data}/build\" SYMBOLIC)" COMPONENT program)
 
-install(FILES README.md LICENSE DESTINATION ${CMAKE_INSTALL_DOCDIR})
+# the manual page and the completion of bash, of what the program itself tells
+install(CODE "
+  set(made \"${PROJECT_BINARY_DIR}/manual\")
+  execute_process(COMMAND python3 \"${PROJECT_SOURCE_DIR}/tools/packaging/manual.py\" \"$<TARGET_FILE:pulmo>\" \"\${made}\"
+                  RESULT_VARIABLE code ERROR_VARIABLE said)
+  if(code EQUAL 0)
+    file(INSTALL \"\${made}/pulmo.1\" DESTINATION \"\${CMAKE_INSTALL_PREFIX}/${CMAKE_INSTALL_MANDIR}/man1\")
+    file(INSTALL \"\${made}/pulmo.bash\" RENAME pulmo
+         DESTINATION \"\${CMAKE_INSTALL_PREFIX}/${CMAKE_INSTALL_DATADIR}/bash-completion/completions\")
+  else()
+    message(WARNING \"no manual page and no completion: python3 could not ask the program (\${code}) \${said}\")
+  endif()" COMPONENT program)
+
+install(FILES README.md LICENSE CHANGELOG.md DESTINATION ${CMAKE_INSTALL_DOCDIR})
+install(FILES CITATION.cff DESTINATION ${data})
 install(DIRECTORY docs/ DESTINATION ${CMAKE_INSTALL_DOCDIR}/docs PATTERN "*.in" EXCLUDE)

@@ -49,15 +49,26 @@ class Install(unittest.TestCase):
                       ["--build", build]):
             run = call(CMAKE, *words)
             self.assertEqual(run.returncode, 0, run.stdout)
+        # a project without CMake: the file for pkg-config goes with its prefix
+        folders = [self.path(cached("CMAKE_INSTALL_LIBDIR"), "pkgconfig")]
+        if cached("PULMO_PETSC_DIR"):
+            folders.append(os.path.join(cached("PULMO_PETSC_DIR"), cached("PULMO_PETSC_ARCH"), "lib/pkgconfig"))
+        said = call("pkg-config", "--cflags", "--libs", "pulmo", environment=PLAIN | dict(PKG_CONFIG_PATH=":".join(folders)))
+        self.assertEqual(said.returncode, 0, said.stdout)
+        flags = said.stdout.split()
+        run = call(cached("CMAKE_CXX_COMPILER"), "-std=c++17", os.path.join(source, "consumer.cpp"), *flags,
+                   *(f"-Wl,-rpath,{flag[2:]}" for flag in flags if flag.startswith("-L")), "-o", os.path.join(build, "by_pkg_config"))
+        self.assertEqual(run.returncode, 0, run.stdout)
         # kernels in headers are compiled once more, with the project's own flags: the last digit may be another
-        theirs, ours = (self.finished(program, pulmo.scratch()).splitlines() for program in
-                        (os.path.join(build, "consumer"), self.path("bin/pulmo")))
-        self.assertEqual(len(theirs), len(ours))
-        self.assertEqual(theirs[0], ours[0])
-        for row, own in zip(theirs[1:], ours[1:]):
-            for value, expected in zip(row.split(","), own.split(","), strict=True):
-                if value != expected:
-                    self.assertAlmostEqual(float(value) / float(expected), 1, delta=1e-12)
+        first, second, ours = (self.finished(program, pulmo.scratch()).splitlines() for program in
+                               (os.path.join(build, "consumer"), os.path.join(build, "by_pkg_config"), self.path("bin/pulmo")))
+        for theirs in first, second:
+            self.assertEqual(len(theirs), len(ours))
+            self.assertEqual(theirs[0], ours[0])
+            for row, own in zip(theirs[1:], ours[1:]):
+                for value, expected in zip(row.split(","), own.split(","), strict=True):
+                    if value != expected:
+                        self.assertAlmostEqual(float(value) / float(expected), 1, delta=1e-12)
 
     def test_the_program_finds_its_libraries_and_tools_find_the_program(self):
         def run_path(program):
