@@ -3,6 +3,7 @@
 
     install_test.py BUILD/pulmo CMAKE BUILD
 """
+import glob
 import os
 import re
 import subprocess
@@ -78,11 +79,13 @@ class Install(unittest.TestCase):
         self.assertNotIn("not found", call("ldd", self.path("bin/pulmo")).stdout)
         self.assertLessEqual(set(run_path(pulmo.PROGRAM)), set(run_path(self.path("bin/pulmo"))))
         data = self.path("share/pulmo")
+        there = set(glob.glob(data + "/**", recursive=True))
         tool = call(os.path.join(data, "tools/reproduce_paper"), "--list", cwd=pulmo.scratch("..")).stdout
         self.assertIn("table2", tool)
         for name in "tools/report", "tools/lung_mesh", "tools/sphere_mesh", "tools/cell_values", "tools/accuracy_cost":
             run = call(os.path.join(data, name), "--help")
             self.assertEqual(run.returncode, 0, run.stdout)
+        self.assertEqual(set(glob.glob(data + "/**", recursive=True)), there, "left in a folder that may not be the user's")
         self.assertTrue(os.path.samefile(os.path.join(data, "build/pulmo"), self.path("bin/pulmo")))
         for name in "README.md", "LICENSE", "docs/ventilator.md":
             self.assertTrue(os.path.exists(self.path("share/doc/pulmo", name)), name)

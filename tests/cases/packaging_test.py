@@ -161,7 +161,7 @@ class Manual(unittest.TestCase):
         for line in call(pulmo.PROGRAM, "-list").splitlines():
             kind, names, about = line.split(None, 2)
             if kind != "example":
-                self.assertIn(f".B {names.replace('|', ', ')}\n{about}\n", self.page)
+                self.assertTrue(f".B {names.replace('|', ', ')}\n{about}\n" in self.page, names)
 
     def test_values_are_completed(self):
         laws = {name for law, alias in pulmo.common.offered(pulmo.PROGRAM, "tissue").items() for name in (law, alias) if name}

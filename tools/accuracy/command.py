@@ -22,7 +22,7 @@ import sys
 from pathlib import Path
 
 from benchmarks.strategies import scene_file
-from shared.common import SOURCE, fail, require
+from shared.common import RESULTS, SOURCE, fail, require
 from shared.keys import lock
 
 from . import page, settings
@@ -73,7 +73,7 @@ def parse(words):
     parser.add_argument("--launcher", default="mpiexec -n", help="words before the number of ranks (default: mpiexec -n)")
     parser.add_argument("--repeat", type=int, default=1, help="runs of each setting; times are medians (default 1)")
     parser.add_argument("--build", type=Path, default=SOURCE / "build", help="build folder (default: build)")
-    parser.add_argument("--output", type=Path, default=SOURCE / "results/accuracy", help="default: results/accuracy")
+    parser.add_argument("--output", type=Path, default=RESULTS / "accuracy", help="default: results/accuracy")
     parser.add_argument("--results", type=Path, help="folder of the runs and of meshes that are made (default: --output)")
     options = parser.parse_args(words[:cut])
     options.flags = words[cut + 1:]

@@ -15,7 +15,7 @@ import signal
 import sys
 from pathlib import Path
 
-from shared.common import SOURCE, tissue_laws
+from shared.common import RESULTS, SOURCE, tissue_laws
 
 from .breaths import table2, tried
 from .cases import QUICK, Cases, Plan
@@ -56,12 +56,12 @@ def parse(arguments):
                         help="two laws on the small test lung with short breaths: a test of the tool")
     parser.add_argument("--runs", type=Path, metavar="DIR", help="where the runs are kept (default results/paper)")
     parser.add_argument("--output", type=Path, metavar="DIR",
-                        help="where figures and page go (default docs/paper; quick: RUNS/page)")
+                        help="where figures and page go (default docs/paper; quick, or where pulmo is installed: RUNS/page)")
     parser.add_argument("--program", type=Path, default=SOURCE / "build/pulmo", help="the program (default build/pulmo)")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="runs at a time (default 1)")
     given = parser.parse_args(arguments)
-    given.runs = (given.runs or SOURCE / "results" / ("paper_quick" if given.quick else "paper")).absolute()
-    given.output = (given.output or (given.runs / "page" if given.quick else SOURCE / "docs/paper")).absolute()
+    given.runs = (given.runs or RESULTS / ("paper_quick" if given.quick else "paper")).absolute()
+    given.output = (given.output or (given.runs / "page" if given.quick or RESULTS.parent != SOURCE else SOURCE / "docs/paper")).absolute()
     given.parts = given.only.split(",") if given.only else list(PARTS)
     unknown = [part for part in given.parts if part not in PARTS]
     if unknown:
@@ -77,7 +77,6 @@ def main(arguments):
     given = parse(arguments)
     plan = QUICK if given.quick else Plan()
     cases = Cases(plan)
-    given.runs.mkdir(parents=True, exist_ok=True)
     workshop = Workshop(given.runs, given.program.absolute(), plan, given.jobs)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("reproduce_paper: stopped; call it again to go on"))
     signal.signal(signal.SIGINT, signal.getsignal(signal.SIGTERM))
@@ -87,6 +86,7 @@ def main(arguments):
             for run in cases.parts[part]:
                 print(f"           {'done' if workshop.done(run) else '    '} {run.name}")
         return 0
+    given.runs.mkdir(parents=True, exist_ok=True)
     others = [law for law in tissue_laws(workshop.program) if law not in {law.name for law in LAWS}]
     if others:
         say(f"not of the paper and left out: {', '.join(others)}")

@@ -9,6 +9,8 @@ import sys
 from pathlib import Path
 
 SOURCE = Path(__file__).resolve().parent.parent.parent
+# an installed tool leaves its results where it is called
+RESULTS = (SOURCE if (SOURCE / "CMakeLists.txt").exists() else Path.cwd()) / "results"
 SCENES = SOURCE / "petsc_options/scenes"
 PAPER = ["-options_file", SCENES / "paper.opts"]  # the readings that the studies were made with
 SOLVERS = SOURCE / "petsc_options/solvers"
