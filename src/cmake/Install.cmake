@@ -32,11 +32,12 @@ install(FILES ${PROJECT_BINARY_DIR}/pulmo.pc DESTINATION ${CMAKE_INSTALL_LIBDIR}
 set(CMAKE_INSTALL_DEFAULT_COMPONENT_NAME program)
 install(TARGETS pulmo RUNTIME)
 install(DIRECTORY petsc_options meshes DESTINATION ${data})
-install(PROGRAMS tools/report tools/lung_mesh tools/sphere_mesh tools/cell_values tools/accuracy_cost tools/reproduce_paper
+install(PROGRAMS tools/breathe tools/report tools/lung_mesh tools/sphere_mesh tools/cell_values tools/accuracy_cost tools/reproduce_paper
         DESTINATION ${data}/tools)
-install(DIRECTORY tools/accuracy tools/benchmarks tools/meshing tools/paper tools/reports tools/shared
+install(DIRECTORY tools/accuracy tools/benchmarks tools/breathing tools/meshing tools/paper tools/reports tools/shared
         DESTINATION ${data}/tools FILES_MATCHING PATTERN "*.py")
 install(DIRECTORY tools/reports/templates DESTINATION ${data}/tools/reports)
+install(FILES tools/packaging/slurm/pulmo.sbatch DESTINATION ${data}/tools/packaging/slurm)
 install(FILES docs/paper/page.md.in DESTINATION ${data}/docs/paper)
 # the tools' build/pulmo is the installed program
 file(RELATIVE_PATH to_program ${CMAKE_INSTALL_FULL_DATADIR}/pulmo ${CMAKE_INSTALL_FULL_BINDIR})

@@ -100,8 +100,9 @@ class Packages(unittest.TestCase):
             self.assertEqual(words[1], "root/root", path)
             self.assertNotIn("w", words[0][5] + words[0][8] if words[0][0] != "l" else "", path)
         self.assertEqual([p for p in of_program if p.endswith((".pyc", "__pycache__/"))], [])
-        for path in "./usr/bin/pulmo", "./usr/share/pulmo/tools/report", "./usr/share/man/man1/pulmo.1", "./usr/share/pulmo/CITATION.cff":
-            self.assertIn(path, of_program)
+        for path in ("bin/pulmo", "share/pulmo/tools/report", "share/pulmo/tools/packaging/slurm/pulmo.sbatch", "share/man/man1/pulmo.1",
+                     "share/bash-completion/completions/pulmo", "share/pulmo/CITATION.cff"):
+            self.assertIn("./usr/" + path, of_program)
         self.assertEqual(len([p for p in of_library if p.endswith(("/libpulmo.a", "/pulmo-config.cmake", "/pkgconfig/pulmo.pc"))]), 3)
         # texts know nothing of the machine that made them
         for where, _, files in os.walk(self.root):
