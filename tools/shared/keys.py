@@ -68,13 +68,13 @@ def libraries(program):
 
 
 def modules(program):
-    """Python files that a script runs on: those of the folders beside it that it, or one of them, imports from."""
+    """Python files that a script runs on: those of the folders beside it, or in `python` there, that it, or one of them, imports from."""
     found, waiting = set(), [Path(program)]
     while waiting:
         text = waiting.pop().read_bytes()
         if found or text.startswith(b"#!"):
             for name in re.findall(rb"^(?:from|import) (\w+)", text, re.MULTILINE):
-                new = set((Path(program).parent / name.decode()).glob("*.py")) - found
+                new = {path for folder in (".", "python") for path in (Path(program).parent / folder / name.decode()).glob("*.py")} - found
                 found |= new
                 waiting += new
     return sorted(map(str, found))
