@@ -94,9 +94,9 @@ def export(given):
     """Carries out a command line; raises PulmoError."""
     check(given)
     run = read(given.directory, given.unfinished)
-    output = given.output or os.path.join(given.directory, "export")
+    given.output = given.output or os.path.join(given.directory, "export")
     made = []
-    with scratch(output) as folder:
+    with scratch(given.output) as folder:
         for kind in dict.fromkeys(given.format):
             if kind == "nifti":
                 from .nifti import export as write
@@ -109,4 +109,4 @@ def export(given):
             moments = moments_of(run, given.times, kind) if kind in ("nifti", "vtu") else []
             made += write(run, given, moments, folder, say)
     for name in made:
-        say(f"wrote {os.path.join(output, name)}")
+        say(f"wrote {os.path.join(given.output, name)}")

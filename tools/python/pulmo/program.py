@@ -1,0 +1,124 @@
+"""Runs the program and varies its options."""
+import atexit
+import itertools
+import os
+import re
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+import pandas
+
+from .errors import PulmoError, RunFailed
+from .run import Run
+
+SOURCE = Path(__file__).resolve().parents[3]  # of the project, or share/pulmo of an installation
+_kept = []  # the folder of runs that no directory was given for
+
+
+def _program():
+    """Path of the program: PULMO_PROGRAM, the one that belongs to these modules, or that on the PATH."""
+    for path in (os.environ.get("PULMO_PROGRAM"), SOURCE / "build/pulmo", shutil.which("pulmo")):
+        if path and os.access(path, os.X_OK):
+            return str(path)
+    raise PulmoError("the program is not there: build it (tools/setup), or give its path in the environment variable PULMO_PROGRAM")
+
+
+def _new_directory():
+    """A folder that goes away when Python ends."""
+    if not _kept:
+        _kept.append(tempfile.mkdtemp(prefix="pulmo_"))
+        atexit.register(shutil.rmtree, _kept[0], ignore_errors=True)
+    return os.path.join(tempfile.mkdtemp(dir=_kept[0]), "run")
+
+
+def _file(name, folder, ending, what):
+    """The path of a file, or of one that comes with pulmo by its short name."""
+    own = SOURCE / folder / f"{name}{ending}"
+    path = Path(name) if os.path.isfile(name) else own
+    if not path.is_file():
+        there = ", ".join(sorted(p.name.removesuffix(ending) for p in (SOURCE / folder).glob("*" + ending)))
+        raise PulmoError(f"there is no {what} {name}: give a file, or one of {there}")
+    return str(path)
+
+
+def _words(options):
+    """Words of the command line for {name: value}: True and False are on and off, None leaves an option out, lists get commas."""
+    words = []
+    for name, value in options.items():
+        if value is None:
+            continue
+        if isinstance(value, bool):
+            value = "on" if value else "off"
+        elif isinstance(value, (list, tuple)):
+            value = ",".join(map(str, value))
+        words += ["-" + name.lstrip("-"), str(value)]
+    return words
+
+
+def _reason(error, output, code):
+    """The program's own sentence, or the first one of who started it."""
+    found = re.search(r"^pulmo: error: (.*?)(?=^-{20}|^=+ *$|^\[|\Z)", error, re.MULTILINE | re.DOTALL)
+    if found:
+        return found[1].strip()
+    said = [line for line in (error + "\n" + output).splitlines() if re.search(r"\w", line)]
+    return said[0] if said else f"the program ended with code {code} and said nothing"
+
+
+def command(scene, mesh, solver="iterative", ranks=1, directory=None, **options):
+    """The words of the command that run() runs: a list of str."""
+    scenes = [scene] if isinstance(scene, (str, os.PathLike)) else list(scene)
+    words = ["mpiexec", "-n", str(ranks)] if ranks > 1 else []
+    words += [_program(), "-dm_plex_filename", _file(mesh, "meshes", ".msh", "mesh")]
+    for name, folder, what in [(solver, "solvers", "solver")] + [(name, "scenes", "scene") for name in scenes]:
+        words += ["-options_file", _file(name, "petsc_options/" + folder, ".opts", what)]
+    return words + _words(options) + (["-output_dir", os.fspath(directory)] if directory else [])
+
+
+def run(scene, mesh, *, solver="iterative", ranks=1, directory=None, **options):
+    """Runs a scene to its end and returns the Run.
+
+    scene: name of a file in petsc_options/scenes ("pcv"), path of an option file, or a list of these; the last one counts most.
+    mesh: name of a mesh that comes with pulmo ("lung_test"), or path of a mesh. solver: name in petsc_options/solvers, or path.
+    ranks: of MPI. directory: where the run goes; None: a folder that goes away when Python ends.
+    options: any other options without their dash, in the units that `pulmo -help` tells: ventilator_pip=8, tissue="yoshihara".
+    True and False are on and off. Names that are no words of Python go as **{"name": value}.
+
+    Raises RunFailed with the program's own sentence if it does not end with code 0.
+    """
+    directory = os.fspath(directory) if directory else _new_directory()
+    environment = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"} | os.environ
+    done = subprocess.run(command(scene, mesh, solver, ranks, directory, **options), env=environment, capture_output=True, text=True)
+    if done.returncode:
+        raise RunFailed(_reason(done.stderr, done.stdout, done.returncode), done.returncode, directory, done.stdout + done.stderr)
+    return Run(directory, done.stdout)
+
+
+def sweep(values, scene, mesh, *, directory=None, **arguments):
+    """Runs all combinations of some values, one after the other, and returns a DataFrame: a row for each run.
+
+    values: {name of an option without its dash: list of values}. directory: folder for the runs, one folder for each (run_001, ...);
+    None: they go away when Python ends. All else as in run().
+
+    Columns: the options that vary, the overall clinical numbers (Run.numbers), `directory`, and `failure`: "" or why that run did
+    not reach its end; its numbers are NaN then, and the others go on. A combination that is wrong input raises RunFailed at once.
+    """
+    if not values or not all(values.values()):
+        raise PulmoError("sweep: there is nothing to vary; give {option: [value, value, ...]}")
+    both = sorted(set(values) & set(arguments))
+    if both:
+        raise PulmoError(f"sweep: {both[0]} is both varied and given")
+    rows = []
+    for number, combination in enumerate(itertools.product(*values.values()), 1):
+        chosen = dict(zip(values, combination))
+        where = os.path.join(os.fspath(directory), f"run_{number:03d}") if directory else _new_directory()
+        try:
+            numbers, failure = dict(run(scene, mesh, directory=where, **arguments | chosen).numbers), ""
+        except RunFailed as error:
+            if error.code == 1:
+                raise
+            numbers, failure = {}, str(error)
+        rows.append(chosen | numbers | {"directory": where, "failure": failure})
+    table = pandas.DataFrame(rows)
+    return table[[name for name in table.columns if name not in ("directory", "failure")] + ["directory", "failure"]]
