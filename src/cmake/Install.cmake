@@ -32,9 +32,9 @@ install(FILES ${PROJECT_BINARY_DIR}/pulmo.pc DESTINATION ${CMAKE_INSTALL_LIBDIR}
 set(CMAKE_INSTALL_DEFAULT_COMPONENT_NAME program)
 install(TARGETS pulmo RUNTIME)
 install(DIRECTORY petsc_options meshes DESTINATION ${data})
-install(PROGRAMS tools/breathe tools/report tools/lung_mesh tools/sphere_mesh tools/cell_values tools/accuracy_cost tools/reproduce_paper
+install(PROGRAMS tools/breathe tools/export tools/report tools/lung_mesh tools/sphere_mesh tools/cell_values tools/accuracy_cost tools/reproduce_paper
         DESTINATION ${data}/tools)
-install(DIRECTORY tools/accuracy tools/benchmarks tools/breathing tools/meshing tools/paper tools/python tools/reports tools/shared
+install(DIRECTORY tools/accuracy tools/benchmarks tools/breathing tools/exports tools/meshing tools/paper tools/python tools/reports tools/shared
         DESTINATION ${data}/tools FILES_MATCHING PATTERN "*.py")
 install(DIRECTORY tools/reports/templates DESTINATION ${data}/tools/reports)
 install(FILES tools/packaging/slurm/pulmo.sbatch DESTINATION ${data}/tools/packaging/slurm)
@@ -57,10 +57,10 @@ install(CODE "
   endif()" COMPONENT program)
 
 # the Python module stands with the tools that use it; Debian's Python finds it here if the prefix is /usr
-set(modules lib/python3/dist-packages)
-file(RELATIVE_PATH to_module ${CMAKE_INSTALL_PREFIX}/${modules} ${CMAKE_INSTALL_FULL_DATADIR}/pulmo/tools/python/pulmo)
-install(CODE "file(MAKE_DIRECTORY \"\$ENV{DESTDIR}\${CMAKE_INSTALL_PREFIX}/${modules}\")
-  file(CREATE_LINK \"${to_module}\" \"\$ENV{DESTDIR}\${CMAKE_INSTALL_PREFIX}/${modules}/pulmo\" SYMBOLIC)" COMPONENT program)
+set(python_modules lib/python3/dist-packages)
+file(RELATIVE_PATH to_module ${CMAKE_INSTALL_PREFIX}/${python_modules} ${CMAKE_INSTALL_FULL_DATADIR}/pulmo/tools/python/pulmo)
+install(CODE "file(MAKE_DIRECTORY \"\$ENV{DESTDIR}\${CMAKE_INSTALL_PREFIX}/${python_modules}\")
+  file(CREATE_LINK \"${to_module}\" \"\$ENV{DESTDIR}\${CMAKE_INSTALL_PREFIX}/${python_modules}/pulmo\" SYMBOLIC)" COMPONENT program)
 
 install(FILES README.md LICENSE CHANGELOG.md DESTINATION ${CMAKE_INSTALL_DOCDIR})
 install(FILES CITATION.cff DESTINATION ${data})
