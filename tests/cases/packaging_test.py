@@ -266,7 +266,7 @@ class Recipes(unittest.TestCase):
         build = text_of("tools/packaging/container/Containerfile").split("\nFROM")[1]
         installed = set(re.search(r"apt-get install (.*?)\nCOPY", build, re.S).group(1).replace("\\\n", " ").split())
         takes = packages_of_setup("compiler") + packages_of_setup("solver") + packages_of_setup("expressions")
-        self.assertLessEqual({name for name in takes if not name.startswith(("openmpi-bin", "libopenblas"))} | {"python3"}, installed)
+        self.assertLessEqual({name for name in takes if not name.startswith(("openmpi-bin", "libopenblas"))} | {"python3", "file"}, installed)
 
     def test_slurm(self):
         """A job that is warned before its time is up queues again and goes on, until the run is that of one that had the time."""
