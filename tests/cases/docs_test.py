@@ -1,8 +1,8 @@
 #!/usr/bin/python3
 """The pages for users: commands run, links lead somewhere, options exist, messages are those that the program gives.
 
-Commands are run in a short form: pulmo with -scene_view_only, which reads and checks all that a run does; tools up to where work would
-begin. Files that a reader would bring (a mask, a mesh, a programme, finished runs) are stand-ins.
+Commands are run in a short form: pulmo with -scene_view_only, which reads and checks all that a run does, and the cheapest elements; tools up
+to where work would begin. Files that a reader would bring (a mask, a mesh, a programme, finished runs) are stand-ins.
 """
 import glob
 import importlib.machinery
@@ -135,7 +135,7 @@ class Commands(unittest.TestCase):
             if "-restart" in words:  # there is no checkpoint; restart_test has one
                 at = words.index("-restart")
                 words = words[:at] + words[at + 2:]
-            return pulmo.Case([w for w in words if w != "-dry_run"] + ["-scene_view_only"], directory="-", cwd=self.here)
+            return pulmo.Case([w for w in words if w != "-dry_run"] + ["-elements", "P1-P1", "-scene_view_only"], directory="-", cwd=self.here)
 
         with ThreadPoolExecutor(4) as pool:
             for (name, words), case in zip(found, pool.map(told, [words for _, words in found])):
