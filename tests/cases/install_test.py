@@ -82,7 +82,7 @@ class Install(unittest.TestCase):
         there = set(glob.glob(data + "/**", recursive=True))
         tool = call(os.path.join(data, "tools/reproduce_paper"), "--list", cwd=pulmo.scratch("..")).stdout
         self.assertIn("table2", tool)
-        for name in "tools/report", "tools/lung_mesh", "tools/sphere_mesh", "tools/cell_values", "tools/accuracy_cost":
+        for name in "tools/export", "tools/report", "tools/lung_mesh", "tools/sphere_mesh", "tools/cell_values", "tools/accuracy_cost":
             run = call(os.path.join(data, name), "--help")
             self.assertEqual(run.returncode, 0, run.stdout)
         self.assertEqual(set(glob.glob(data + "/**", recursive=True)), there, "left in a folder that may not be the user's")

@@ -30,11 +30,12 @@ def wanted_fields(run, asked, say):
 
 
 def placement_of(run, given, grid, say):
-    """The Placement of the mesh in the image, checked against it; places, volumes: points that share out the lung at rest."""
-    places, _, volumes = Fields(run.directory).lattice
+    """The Placement of the mesh in the image, checked against it."""
     source, option = (given.labels, "--labels") if given.labels else (given.grid, "--grid")
     if not source:
         return place.Placement()
+    places, _, volumes = Fields(run.directory).lattice  # points that share out the lung at rest
+    lungs = None
     try:
         lungs = place.lungs_of(source, option)
     except PulmoError as error:
@@ -42,7 +43,8 @@ def placement_of(run, given, grid, say):
             raise
         if given.fit:
             raise PulmoError(f"--fit needs the lungs of a label image, but {error}; name one with --labels") from None
-        lungs = None
+        say(f"only the boxes of lung and image were compared, and the lung may lie elsewhere in it, for {error}; --labels LABELS.nii.gz "
+            "compares more")
     placement = place.Placement()
     if given.fit:
         placement, on, covered = place.fitted(lungs, places, volumes)
@@ -50,10 +52,7 @@ def placement_of(run, given, grid, say):
             f"middle of the image's lungs; displacements are, too. {100 * on:.0f} % of it then lies on them and covers {100 * covered:.0f} %")
     moved = placement.of(places)
     place.check_box(grid, moved, volumes, say)
-    if lungs is None:
-        say(f"{given.grid} is no image of labels: only the boxes of lung and image were compared, and the lung may lie elsewhere in it; "
-            "--labels LABELS.nii.gz compares more")
-    elif not given.fit:
+    if lungs and not given.fit:
         place.check_lungs(lungs, moved, volumes, say)
     return placement
 
@@ -84,43 +83,46 @@ def save(path, values, grid, description):
     nibabel.save(image, path)
 
 
+def values_at(fields, moments, names, factor):
+    """(on nodes, on cells) at some times, {name with its time: values}; lengths times a factor."""
+    found = {"Node": {}, "Cell": {}}
+    for snapshot in moments:
+        for name in names:
+            values = fields.values(name, snapshot)
+            found[fields.centers[name]][f"{name}_{clock(fields, snapshot)}"] = values * factor if name == "displacement_mm" else values
+    return found["Node"], found["Cell"]
+
+
+def clock(fields, snapshot):
+    return f"{fields.times[snapshot]:.9g}s"
+
+
+def check_volume(inside, grid, volume, say):
+    """Tells if the voxels in the lung (of a volume, mm^3) do not have its volume."""
+    held = np.count_nonzero(inside) * grid.voxel
+    if held == 0:
+        raise PulmoError("no voxel's centre lies in the lung: the voxels are too large, or the image lies elsewhere")
+    if abs(held / volume - 1) > VOLUME_ERROR:
+        say(f"WARNING: the voxels in the lung have {held / 1e3:.0f} ml, the lung has {volume / 1e3:.0f} ml: it reaches out of the image, "
+            "or the voxels are coarse")
+
+
 def export(run, given, moments, folder, say):
     """Writes one file for each field and time, and masks of the lung, into a folder; returns their names."""
     if given.fit and not (given.grid or given.labels):
         raise PulmoError("--fit needs a label image: --grid or --labels")
-    fields, names = run.fields, wanted_fields(run, given.fields, say)
+    fields, names, made = run.fields, wanted_fields(run, given.fields, say), []
     grid = grid_of(run, given, moments, say)
     placement = placement_of(run, given, grid, say)
     deformed = given.shape == "deformed"
-    on_nodes, on_cells, made = {}, {}, []
-
-    def clock(snapshot):
-        return f"{fields.times[snapshot]:.9g}s"
-
-    for snapshot in moments:
-        for name in names:
-            values = fields.values(name, snapshot)
-            if name == "displacement_mm":
-                values = values * placement.factor
-            (on_nodes if fields.centers[name] == "Node" else on_cells)[f"{name}_{clock(snapshot)}"] = values
-    groups = [[snapshot] for snapshot in moments] if deformed else [moments]
-    for group in groups:
-        def mine(values):
-            return {key: v for key, v in values.items() if key.rsplit("_", 1)[1] in map(clock, group)}
-        moved = fields.points + (fields.values("displacement_mm", group[0]) if deformed else 0)
-        inside, found = probe.sample(grid, placement.of(moved), fields.cells, mine(on_nodes), mine(on_cells), deformed)
-        volume = (fields.volume(group[0]) if deformed else fields.volumes.sum()) * placement.factor**3
-        held = np.count_nonzero(inside) * grid.voxel
-        if held == 0:
-            raise PulmoError("no voxel's centre lies in the lung: the voxels are too large, or the image lies elsewhere")
-        if abs(held / volume - 1) > VOLUME_ERROR:
-            say(f"WARNING: the voxels in the lung have {held / 1e3:.0f} ml, the lung has {volume / 1e3:.0f} ml"
-                + (f" at {clock(group[0])}" if deformed else "") + ": it reaches out of the image, or the voxels are coarse")
-        lung = f"lung_{clock(group[0])}" if deformed else "lung"
+    for group in [[snapshot] for snapshot in moments] if deformed else [moments]:
+        shape = fields.points + (fields.values("displacement_mm", group[0]) if deformed else 0)
+        inside, found = probe.sample(grid, placement.of(shape), fields.cells, *values_at(fields, group, names, placement.factor))
+        check_volume(inside, grid, (fields.volume(group[0]) if deformed else fields.volumes.sum()) * placement.factor**3, say)
+        lung = f"lung_{clock(fields, group[0])}" if deformed else "lung"
         for key, values in [(lung, inside.astype(np.uint8)), *found.items()]:
             if given.outside == "nan" and key != lung:
                 values[~inside] = np.nan
-            path = f"{key}.nii.gz"
-            save(os.path.join(folder, path), values, grid, f"pulmo: {key}, {given.shape} shape, {given.outside} outside the lung")
-            made.append(path)
+            made.append(f"{key}.nii.gz")
+            save(os.path.join(folder, made[-1]), values, grid, f"pulmo: {key}, {given.shape} shape, {given.outside} outside the lung")
     return made

@@ -6,7 +6,10 @@ from vtkmodules.vtkCommonDataModel import VTK_QUADRATIC_TETRA, VTK_TETRA, vtkCel
 from vtkmodules.vtkFiltersCore import vtkProbeFilter
 
 SLAB = 2_000_000  # voxels at a time: memory
-# a quadratic tetrahedron as straight ones between its ten nodes
+# voxels: VTK counts what lies just on a face as inside, so a cube on the grid's planes would get voxels on both of its sides
+ASIDE = np.array([1.0, 0.7, 0.4]) * 1e-6
+# a tetrahedron of ten nodes as straight ones between them. VTK looks for a cell in the box of its nodes, which a curved face leaves:
+# curved cells would have gaps between them
 PIECES = np.array([[0, 4, 6, 7], [4, 1, 5, 8], [6, 5, 2, 9], [7, 8, 9, 3], [6, 4, 5, 8], [6, 5, 9, 8], [6, 9, 7, 8], [6, 7, 4, 8]])
 
 
@@ -44,38 +47,33 @@ def probed(mesh, low, shape, names):
     return inside, {name: vtk_to_numpy(found.GetArray(name)) for name in names}
 
 
-def sample(grid, points, cells, on_nodes, on_cells, curved):
+def sample(grid, points, cells, on_nodes, on_cells):
     """(inside, {name: values}): whether the voxels' centres lie in the lung, (nx, ny, nz), and fields there, zero elsewhere,
     (nx, ny, nz) or (nx, ny, nz, 3), single precision.
 
-    points: (n, 3) of the nodes in the world, mm. cells: (m, 10). on_nodes, on_cells: {name: values}. curved: whether edges are.
+    points: (n, 3) of the nodes in the world, mm. cells: (m, 10). on_nodes, on_cells: {name: values}.
     """
-    at = grid.indices(points)  # the grid's axes need not be those of the world
+    at = grid.indices(points) + ASIDE  # the grid's axes need not be those of the world
     low = np.maximum(np.floor(at.min(axis=0)).astype(int), 0)
     high = np.minimum(np.ceil(at.max(axis=0)).astype(int) + 1, grid.shape)
     inside = np.zeros(grid.shape, bool)
     fields = {name: np.zeros(grid.shape + values.shape[1:], np.float32) for name, values in (on_nodes | on_cells).items()}
     if (high <= low).any():
         return inside, fields
-    meshes = [tetrahedra(at, cells)]
-    if curved:  # VTK looks for a cell in the box of its nodes, which a curved face may leave: straight pieces fill those gaps
-        meshes.insert(0, tetrahedra(at, cells[:, PIECES].reshape(-1, 4)))
-    for mesh in meshes:
-        repeated = mesh.GetNumberOfCells() // len(cells)
-        for name, values in on_nodes.items():
-            add(mesh.GetPointData(), name, values.astype(np.float32))
-        for name, values in on_cells.items():
-            add(mesh.GetCellData(), name, np.repeat(values, repeated).astype(np.float32))
+    mesh = tetrahedra(at, cells[:, PIECES].reshape(-1, 4))
+    for name, values in on_nodes.items():
+        add(mesh.GetPointData(), name, values.astype(np.float32))
+    for name, values in on_cells.items():
+        add(mesh.GetCellData(), name, np.repeat(values, len(PIECES)).astype(np.float32))
     thick = max(1, SLAB // int(np.prod(high[:2] - low[:2])))
     for begin in range(low[2], high[2], thick):
         end = min(begin + thick, high[2])
         shape = (*(high[:2] - low[:2]), end - begin)
         part = slice(low[0], high[0]), slice(low[1], high[1]), slice(begin, end)
-        for mesh in meshes:
-            here, found = probed(mesh, (low[0], low[1], begin), shape, fields)
-            here = here.reshape(shape, order="F")
-            inside[part] |= here
-            for name, values in found.items():
-                values = values.reshape(*shape, *values.shape[1:], order="F")
-                fields[name][part][here] = values[here]
+        here, found = probed(mesh, (low[0], low[1], begin), shape, fields)
+        here = here.reshape(shape, order="F")
+        inside[part] = here
+        for name, values in found.items():
+            values = values.reshape(*shape, *values.shape[1:], order="F")
+            fields[name][part][here] = values[here]
     return inside, fields

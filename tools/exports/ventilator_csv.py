@@ -40,6 +40,8 @@ def export(run, given, moments, folder, say):
         say(f"{len(breaths) - len(whole)} of {len(breaths)} breaths were cut and are left out")
     with open(os.path.join(folder, NAME), "w", encoding="ascii") as out:
         for number, breath in whole:
-            rows = zip(*samples(run, breath["start_s"], breath["end_s"]))
+            flow, pressure = samples(run, breath["start_s"], breath["end_s"])
+            flow = np.diff(np.cumsum(flow).round(2), prepend=0)  # what rounding takes from a line it gives to the next
+            rows = zip(flow + 0.0, pressure)
             out.write(f"BS, S:{number},\n" + "".join(f"{flow:.2f}, {pressure:.2f}\n" for flow, pressure in rows) + "BE\n")
     return [NAME]

@@ -2,22 +2,11 @@
 import os
 
 import numpy as np
-from vtkmodules.vtkCommonCore import vtkStringArray
 from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
 from pulmo.errors import PulmoError
 
 from .probe import add, tetrahedra
-
-
-def regions(run):
-    """The names of the regions as an array; the name of region_number n is at n (0: in none)."""
-    names = vtkStringArray()
-    names.SetName("region_names")
-    entries = {entry["number"]: name for name, entry in (run.summary.get("regions") or {}).items() if "number" in entry}
-    for number in range(max(entries, default=0) + 1):
-        names.InsertNextValue(entries.get(number, ""))
-    return names
 
 
 def export(run, given, moments, folder, say):
@@ -32,7 +21,8 @@ def export(run, given, moments, folder, say):
             if values is not None:
                 add(mesh.GetPointData() if fields.centers[name] == "Node" else mesh.GetCellData(), name, values)
         add(mesh.GetFieldData(), "TimeValue", np.array([fields.times[snapshot]]))
-        mesh.GetFieldData().AddArray(regions(run))
+        for name, region in (run.summary.get("regions") or {}).items():
+            add(mesh.GetFieldData(), f"region_number_of_{name}", np.array([region["number"]]))
         writer = vtkXMLUnstructuredGridWriter()
         made.append(f"fields_{number:05d}.vtu")
         writer.SetFileName(os.path.join(folder, made[-1]))

@@ -8,10 +8,9 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-import pandas
-
 from .errors import PulmoError, RunFailed
 from .run import Run
+from .tables import pandas
 
 SOURCE = Path(__file__).resolve().parents[3]  # of the project, or share/pulmo of an installation
 _kept = []  # the folder of runs that no directory was given for
@@ -120,5 +119,5 @@ def sweep(values, scene, mesh, *, directory=None, **arguments):
                 raise
             numbers, failure = {}, str(error)
         rows.append(chosen | numbers | {"directory": where, "failure": failure})
-    table = pandas.DataFrame(rows)
+    table = pandas().DataFrame(rows)
     return table[[name for name in table.columns if name not in ("directory", "failure")] + ["directory", "failure"]]

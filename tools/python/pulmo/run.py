@@ -1,9 +1,8 @@
 """A run as tables and arrays."""
 import functools
 
-import pandas
-
 from .files import RunFiles
+from .tables import pandas
 
 
 class Run:
@@ -26,19 +25,19 @@ class Run:
     def signals(self):
         """DataFrame of signals.csv: a row for each accepted step, the first at t = 0; time_s, airway_pressure_cmH2O, flow_ml_per_s (mean
         over the step, into the lung positive), volume_ml (above rest), phase, ... and columns that effects add."""
-        return pandas.DataFrame(self._files.signals)
+        return pandas().DataFrame(self._files.signals)
 
     @functools.cached_property
     def energy(self):
         """DataFrame of energy.csv: sums since t = 0, J, a row for each step; raises Missing where the run kept no balance."""
-        return pandas.DataFrame({name if name == "time_s" else name + "_j": values for name, values in self._files.energy.items()})
+        return pandas().DataFrame({name if name == "time_s" else name + "_j": values for name, values in self._files.energy.items()})
 
     @functools.cached_property
     def breaths(self):
         """DataFrame of the clinical numbers, a row for each breath, numbered from 1; NaN where a breath does not define one."""
         rows = [{key: value for key, value in breath.items() if not isinstance(value, (dict, list))}
                 for breath in self.summary.get("breaths") or []]
-        table = pandas.DataFrame(rows, index=pandas.RangeIndex(1, len(rows) + 1, name="breath"))
+        table = pandas().DataFrame(rows, index=pandas().RangeIndex(1, len(rows) + 1, name="breath"))
         return table.astype({name: float for name in table.columns if name != "complete"})
 
     @functools.cached_property
@@ -47,12 +46,12 @@ class Run:
         Empty for a run without breaths."""
         names = [name for name in self.breaths.columns if name in self.summary]
         extra = [name for name in ("functional_residual_capacity_ml",) if name in self.summary]
-        return pandas.Series({name: self.summary[name] for name in names + extra}, dtype=float)
+        return pandas().Series({name: self.summary[name] for name in names + extra}, dtype=float)
 
     @functools.cached_property
     def regions(self):
         """DataFrame of the regions' numbers, a row for each by name."""
-        return pandas.DataFrame.from_dict(self.summary.get("regions") or {}, orient="index")
+        return pandas().DataFrame.from_dict(self.summary.get("regions") or {}, orient="index")
 
     @property
     def fields(self):

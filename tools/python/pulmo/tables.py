@@ -4,6 +4,13 @@ import csv
 import numpy as np
 
 
+def pandas():
+    """pandas, loaded with the first DataFrame: tools that read runs need none."""
+    import pandas as loaded
+
+    return loaded
+
+
 def whole_rows(path):
     """Rows of a table, {column: text}; one that is not written to its end yet is left out."""
     with open(path, newline="") as f:
