@@ -20,7 +20,7 @@ from PIL import Image
 import pulmo_case as pulmo
 
 sys.path.insert(0, os.path.join(pulmo.SOURCE, "tools"))
-from reports import charts, cuts, page, pictures, pv_curve, run as of_run, sections  # noqa: E402
+from reports import animation, charts, cuts, page, pictures, pv_curve, run as of_run, sections  # noqa: E402
 
 COARSE = ["-elements", "P1-P1", "-ts_dt", "0.1"]
 WEIGHT = ["-gravity", "-gravity_direction", "0,-1,0", "-tissue_porosity", "0.75"]
@@ -275,6 +275,28 @@ class Runs(unittest.TestCase):
             self.assertEqual(refused.returncode, 1, arguments)
             self.assertIn(word, refused.stderr)
             self.assertEqual(len(refused.stderr.splitlines()), 1, refused.stderr)
+
+    def test_animation_shows_each_snapshot_as_long_as_it_was(self):
+        path = pulmo.scratch("breath.gif")
+        made = called(self.case.directory, "--animation", path)
+        self.assertEqual(made.returncode, 0, made.stderr)
+        times = of_run.load([self.case.directory])[0].fields.times
+        self.assertIn(f"{len(times)} frames", made.stdout)
+        with Image.open(path) as picture:
+            self.assertEqual(picture.n_frames, len(times))
+            for frame, span in enumerate(np.diff(times)):
+                picture.seek(frame)
+                self.assertAlmostEqual(picture.info["duration"] / 1000, span, delta=0.011)  # GIF counts hundredths of a second
+        self.assertFalse(os.path.exists(os.path.join(self.case.directory, "report.html")))
+
+    def test_animation_refuses_what_it_cannot_make(self):
+        path = pulmo.scratch("breath.mp4")
+        with mock.patch.object(animation.shutil, "which", lambda name: None):
+            for words, said in ((["--animation", path], "ffmpeg"), (["--animation", "a.avi"], ".gif"), ([self.other.directory, "--animation", "a.gif"], "one run")):
+                refused = called(self.case.directory, *words)
+                self.assertEqual((refused.returncode, len(refused.stderr.splitlines())), (1, 1), refused.stderr)
+                self.assertIn(said, refused.stderr)
+        self.assertEqual(os.listdir(os.path.dirname(path)), [])
 
     def test_damaged_fields_cost_their_sections_only(self):
         for what, how in (("fields.xdmf", lambda path: os.truncate(path, 200)), ("fields.h5", os.remove), ("fields_00000.h5", os.remove)):
