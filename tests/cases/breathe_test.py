@@ -19,8 +19,7 @@ import pulmo_case as pulmo
 
 TOOL = os.path.join(pulmo.SOURCE, "tools/breathe")
 LUNG = os.path.join(pulmo.SOURCE, "meshes/lung_test.msh")
-BUILD = ["--build", os.path.dirname(pulmo.PROGRAM)]
-QUICK = ["--elements", "P1-P1", "--ranks", "1", *BUILD]
+QUICK = ["--elements", "P1-P1", "--ranks", "1"]
 STEPS = ["--", "-ts_dt", "0.1"]
 
 
@@ -31,9 +30,16 @@ def folder():
     return path
 
 
+def with_build(words):
+    """The words of a call with the build folder, unless they name one or go on with a folder."""
+    words = [str(word) for word in words]
+    known = "--build" in words or len(words) == 1 and not words[0].endswith((".msh", ".py"))
+    return words if known else [words[0], "--build", os.path.dirname(pulmo.PROGRAM), *words[1:]]
+
+
 def called(*words, cwd=None):
-    """A call, in a folder of its own unless one is named."""
-    return subprocess.run([TOOL, *map(str, words)], capture_output=True, text=True, timeout=300, env=pulmo.ENVIRONMENT, cwd=cwd or folder())
+    """A call with the program at hand, in a folder of its own unless one is named."""
+    return subprocess.run([TOOL, *with_build(words)], capture_output=True, text=True, timeout=300, env=pulmo.ENVIRONMENT, cwd=cwd or folder())
 
 
 def rows(folder):
@@ -112,7 +118,7 @@ class Mesh(unittest.TestCase):
         place = folder()
         shutil.copyfile(self.place / "mine.txt", place / "mine.txt")
         words = [word if word != "bt" else "basic" for word in self.words]
-        process = subprocess.Popen([TOOL, *words], cwd=place, env=pulmo.ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        process = subprocess.Popen([TOOL, *with_build(words)], cwd=place, env=pulmo.ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
                                    start_new_session=True)
         signals = place / "case/run/signals.csv.part"
         wait_for(lambda: signals.exists() and signals.read_text().count("\n") > 3)
@@ -162,7 +168,7 @@ class Mistakes(unittest.TestCase):
                             ([LUNG, "--pip"], "--pip"), ([__file__], "label image"), ([LUNG, "--build", "nowhere"], "tools/setup"),
                             ([LUNG, "--", "tissue"], "belongs to no option"), ([LUNG, "--", "-options_file", "no.opts"], "no.opts")):
             with self.subTest(words=words):
-                self.refused(*words, *([] if "--" in words or "--build" in words else BUILD), said=said)
+                self.refused(*words, said=said)
 
     def test_folders(self):
         place = folder()
@@ -170,7 +176,7 @@ class Mistakes(unittest.TestCase):
         (place / "full/thesis.txt").write_text("mine")
         (place / "broken").mkdir()
         (place / "broken/case.json").write_text("{")
-        self.refused(LUNG, "--case", "full", *BUILD, said="holds other files", cwd=place)
+        self.refused(LUNG, "--case", "full", said="holds other files", cwd=place)
         self.refused("broken", said="damaged", cwd=place)
         self.assertEqual((place / "full/thesis.txt").read_text(), "mine")
 

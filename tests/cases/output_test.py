@@ -125,7 +125,7 @@ class Breaths(unittest.TestCase):
     def test_files(self):
         snapshots = len(schedule()) + 1
         self.assertEqual(self.case.files(), sorted(
-            ["signals.csv", "summary.json", "energy.csv", "fields.xdmf", "fields.h5"] + [f"fields_{i:05d}.h5" for i in range(snapshots)]))
+            ["signals.csv", "scene.json", "summary.json", "energy.csv", "fields.xdmf", "fields.h5"] + [f"fields_{i:05d}.h5" for i in range(snapshots)]))
         self.assertEqual(self.case.code, 0)
 
     def test_columns_and_first_row(self):
@@ -440,7 +440,7 @@ class OtherScenes(unittest.TestCase):
             f.write("the user's own\n")
         again = pulmo.finished(base + ["-airflow", "off", "-output_overwrite"], directory=first.directory)
         self.assertEqual(again.files(), sorted(["energy.csv", "fields.h5", "fields.xdmf", "fields_00000.h5", "fields_00001.h5",
-                                                "notes.txt", "signals.csv", "summary.json"]))
+                                                "notes.txt", "scene.json", "signals.csv", "summary.json"]))
 
     def test_several_runs_share_no_file(self):
         """The output directory may be several levels deep and is made."""

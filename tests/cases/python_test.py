@@ -74,7 +74,7 @@ class Module(unittest.TestCase):
         other = pulmo.run(["pcv", os.path.join(case.SOURCE, "petsc_options/scenes/paper.opts")], case.mesh("cube_lung.msh"), directory=kept,
                           mesh_scale=10, energy_audit=False, chest_wall_surfaces=["pleura"], ventilator_peep=None, ts_max_time=0.4, **FAST)
         used = other.summary["options"]
-        self.assertEqual([used["energy_audit"], used["chest_wall_surfaces"], used["lumen_pressure"]], ["off", "pleura", "off"])
+        self.assertEqual([used["-energy_audit"], used["-chest_wall_surfaces"], used["-lumen_pressure"]], ["off", "pleura", "off"])
         self.assertEqual(other.directory, kept)
         with self.assertRaisesRegex(pulmo.Missing, "energy_audit off"):
             other.energy
