@@ -157,7 +157,7 @@ class Commands(unittest.TestCase):
                     if str(given.source) in made:
                         continue
                     self.assertTrue(given.source.exists(), f"{given.source} is none of the files of this test")
-                    self.assertGreater(len(breathe.scene_words(given)), 1)
+                    self.assertGreater(len(breathe.scene_words(given) + breathe.own_words(given)), 1)
                     self.assertTrue(breathe.solver_file(given.solver).is_file())
                     made.add(str(given.case or f"results/{breathe.stem(given.source)}-{given.mode}"))
         finally:
