@@ -5,10 +5,13 @@ Commands are run in a short form: pulmo with -scene_view_only, which reads and c
 to where work would begin. Files that a reader would bring (a mask, a mesh, a programme, finished runs) are stand-ins.
 """
 import glob
+import importlib.machinery
+import importlib.util
 import os
 import re
 import shlex
 import shutil
+import sys
 import unittest
 from concurrent.futures import ThreadPoolExecutor
 from unittest import mock
@@ -71,6 +74,14 @@ def filled(words):
             whole = any(re.search(r"^-ventilator ", page(w), re.M) for w in words if w.startswith("petsc_options/"))
             words = words[:at] + LEFT_OUT + ([] if whole else MANOEUVRE) + words[at + 1:]
     return words
+
+
+def door_of(tool):
+    """The script of a tool as a module."""
+    loader = importlib.machinery.SourceFileLoader(f"door_of_{tool}", os.path.join(pulmo.SOURCE, "tools", tool))
+    door = importlib.util.module_from_spec(importlib.util.spec_from_loader(loader.name, loader))
+    loader.exec_module(door)
+    return door
 
 
 def anchors(text):
@@ -192,6 +203,17 @@ class Commands(unittest.TestCase):
                     self.assertEqual(len(drawn), before + 1)
         finally:
             os.chdir(here)
+
+    def test_export(self):
+        """Words are taken, nothing is written."""
+        found = [(name, words) for name, words in of_all("tools/export") if words != ["--help"]]
+        self.assertGreater(len(found), 3)
+        door, taken = door_of("export"), []
+        door.export = taken.append
+        for name, words in found:
+            with self.subTest(page=name, command=" ".join(words)), mock.patch.object(sys, "argv", ["export", *words]):
+                door.main()
+                self.assertEqual(taken[-1].directory, words[0])
 
     def test_tools_that_pages_name_are_there(self):
         for name in ALL:
