@@ -1,7 +1,5 @@
 #!/usr/bin/python3
 """tools/export: images, VTU, ParaView's script and the CSV of ventilators, against closed forms, HDF5 and signals."""
-import contextlib
-import io
 import os
 import runpy
 import shutil
@@ -26,17 +24,8 @@ DEFAULT = ["J_mean", "alveolar_pressure_cmH2O", "displacement_mm", "ventilation_
 
 def export(*arguments):
     """(exit code, output, errors) of tools/export."""
-    out, err = io.StringIO(), io.StringIO()
-    path = os.path.join(pulmo.SOURCE, "tools/export")
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), mock.patch.object(sys, "argv", [path, *map(str, arguments)]), \
-            mock.patch.object(sys, "path", [os.path.join(pulmo.SOURCE, "tools"), *sys.path]):
-        try:
-            runpy.run_path(path, run_name="__main__")
-            code = 0
-        except SystemExit as end:
-            code = end.code if isinstance(end.code, int) else 1
-            err.write("" if isinstance(end.code, int) else f"{end.code}\n")
-    return code, out.getvalue(), err.getvalue()
+    made = pulmo.tool_called("export", *arguments)
+    return made.returncode, made.stdout, made.stderr
 
 
 def image(values, affine, unit="mm"):

@@ -3,16 +3,20 @@
 A test script is called with the program and the launcher: SCRIPT PULMO [MPIEXEC ARGUMENTS... -n].
 By hand: tests/cases/output_test.py build/pulmo
 """
+import contextlib
 import csv
+import io
 import json
 import os
 import re
+import runpy
 import signal
 import subprocess
 import sys
 import tempfile
 import time
 import unittest
+from unittest import mock
 
 import h5py
 import numpy as np
@@ -59,6 +63,21 @@ UNIFORM, COMMON = ["-ventilator_flow_split", "uniform"], ["-ventilator_flow_spli
 FLOW_OF_TWO = ["-ventilator", "vcv", "-ventilator_tidal_volume", "40", "-ventilator_inspiration", "0.3",
                "-ventilator_pause", "0.2", "-ventilator_expiration", "0.3", "-airflow_permeability", "2e3"]
 QUIET = ["-progress", "off"]
+
+
+def tool_called(name, *arguments):
+    """What a call of a tool gives (a CompletedProcess), made within this process: a start of Python costs more than most of them."""
+    out, err = io.StringIO(), io.StringIO()
+    command = [os.path.join(SOURCE, "tools", name), *map(str, arguments)]
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), mock.patch.object(sys, "argv", command), \
+            mock.patch.object(sys, "path", [os.path.join(SOURCE, "tools"), *sys.path]):
+        try:
+            runpy.run_path(command[0], run_name="__main__")
+            code = 0
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else 0 if end.code is None else 1
+            err.write("" if isinstance(end.code, (int, type(None))) else f"{end.code}\n")
+    return subprocess.CompletedProcess(command, code, out.getvalue(), err.getvalue())
 
 
 def scratch(name=""):

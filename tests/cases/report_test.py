@@ -1,12 +1,9 @@
 #!/usr/bin/python3
 """tools/report: the page of a run, of several, of one that failed or is at work, in a browser and without one."""
-import contextlib
 import html.parser
-import io
 import json
 import os
 import re
-import runpy
 import shutil
 import subprocess
 import sys
@@ -35,16 +32,7 @@ def tool(*arguments):
 
 def called(*arguments):
     """What tool() gives, without a new Python."""
-    out, err = io.StringIO(), io.StringIO()
-    path = os.path.join(pulmo.SOURCE, "tools/report")
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), mock.patch.object(sys, "argv", [path, *map(str, arguments)]):
-        try:
-            runpy.run_path(path, run_name="__main__")
-            code = 0
-        except SystemExit as end:
-            code = end.code if isinstance(end.code, int) else 1
-            err.write("" if isinstance(end.code, int) else f"{end.code}\n")
-    return subprocess.CompletedProcess([path, *arguments], code, out.getvalue(), err.getvalue())
+    return pulmo.tool_called("report", *arguments)
 
 
 def written(*directories):
