@@ -113,6 +113,29 @@ class Mesh(unittest.TestCase):
         self.assertEqual(json.loads((place / "case/run/summary.json").read_text())["tissue"], "ma")
         self.assertEqual(rows(place / "case/run_before_1"), rows(self.case / "run"))
 
+    def test_option_files_mean_what_they_say(self):
+        """Comments, quotes, aliases, files within files, YAML."""
+        place = folder()
+        (place / "more.opts").write_text("-chest_wall_stiffness 0.1 # kPa/mm\n")
+        (place / "last.yaml").write_text("ts_max_time: 0.2\n")
+        (place / "mine.opts").write_text('# mine\nalias -pip -ventilator_pip\n-options_file more.opts\n-pip 5\n-ventilator pcv\n-tissue "ma" # a law\n'
+                                         "-airflow\n-airflow_permeability 1e4\n-chest_wall\n-options_file last.yaml\n")
+        made = called(LUNG, "--mode", "mine.opts", *QUICK, "--case", "c", *STEPS, "-prestress_pressure", "-0.5", cwd=place)
+        self.assertEqual((made.returncode, made.stderr.count("-prestress_pressure")), (1, 1), made.stderr)
+        made = called(LUNG, "--mode", "mine.opts", *QUICK, "--case", "c2", *STEPS, cwd=place)
+        self.assertEqual(made.returncode, 0, made.stdout + made.stderr)
+        options = json.loads((place / "c2/run/summary.json").read_text())["options"]
+        self.assertEqual([options[name] for name in ("-tissue", "-ventilator_pip", "-chest_wall_stiffness", "-ts_max_time")], ["ma", "5", "0.1", "0.2"])
+
+    def test_overwriting_leaves_the_users_files(self):
+        place = folder()
+        shutil.copytree(self.place, place, dirs_exist_ok=True)
+        (place / "case/notes.txt").write_text("mine")
+        made = called(LUNG, "--overwrite", "--dry-run", *self.words[1:], cwd=place)
+        self.assertEqual(made.returncode, 0, made.stderr)
+        self.assertEqual((place / "case/notes.txt").read_text(), "mine")
+        self.assertFalse((place / "case/run").exists())
+
     def test_interrupted_it_goes_on(self):
         place = folder()
         shutil.copyfile(self.place / "mine.txt", place / "mine.txt")
@@ -165,7 +188,7 @@ class Mistakes(unittest.TestCase):
         for words, said in ((["none.msh"], "there is no none.msh"), ([LUNG, "--mode", "pvc"], "pcv"), ([LUNG, "--effects", "gravty"], "gravity"),
                             ([LUNG, "--volume", "2500ml"], "--volume"), ([LUNG, "--ranks", "0"], "--ranks"), ([LUNG, "--solver", "x"], "iterative"),
                             ([LUNG, "--pip"], "--pip"), ([__file__], "label image"), ([LUNG, "--build", "nowhere"], "tools/setup"),
-                            ([LUNG, "--", "tissue"], "belongs to no option"), ([LUNG, "--", "-options_file", "no.opts"], "no.opts")):
+                            ([LUNG, "--", "tissue"], "belongs to no option"), ([LUNG, "--", "-output_dir", "x"], "-output_dir"), ([LUNG, "--", "-options_file", "no.opts"], "no.opts")):
             with self.subTest(words=words):
                 self.refused(*words, said=said)
 

@@ -12,20 +12,24 @@ OPTION_FILE = "-options_file"
 OPTION_FILES = {"scene": "the scene: mode and effects", "solver": "the solver", "own": "numbers and options of the call, which override what stands before"}
 
 
+# what a call leaves in its folder; anything else is the user's
+MADE = ("case.json", "lung.msh", "mesh.html", "mesh.txt", "inputs", "accuracy", "accuracy.txt", "accuracy.opts", "dry_run.txt", "run", "run.sh",
+        "pulmo.log", "report.html", *(f"{name}.opts" for name in OPTION_FILES))
+OURS = ("-dm_plex_filename", "-output_dir", "-output_overwrite", "-restart", "-dry_run", "-scene_view_only", "-help", "-progress")  # breathe gives these
+
+
 def read_options(path):
-    """[(name, value)] of an option file, those of files that it names in their place."""
+    """[(name, value)] of an option file, those of files that it names in their place. A line without a dash (alias) is a name of its own."""
     pairs = []
     for line in Path(path).read_text(encoding="utf-8-sig").splitlines():
-        words = re.sub(r"(^|\s)#.*", "", line).strip().split(None, 1)
-        if not words:
+        line = line.strip()
+        if not line.startswith("-"):
+            pairs += [(re.sub(r"\s#.*", "", line), "")] if line and line[0] != "#" else []
             continue
-        value = words[1].strip() if len(words) > 1 else ""
+        name, value = re.match(r"""(\S+)\s*("[^"]*"|'[^']*'|.*?)\s*(?:(?<=\s)#.*)?$""", line).groups()
         if value[:1] == value[-1:] and value[:1] in ("'", '"'):
             value = value[1:-1]
-        if words[0] == OPTION_FILE:
-            pairs += read_options(found(value) or fail(f"{path} names an option file {value} that is not there"))
-        else:
-            pairs.append((words[0], value))
+        pairs += option(name, value, f"{path} names an option file {value}, which is not there")
     return pairs
 
 
@@ -37,11 +41,17 @@ def pairs_of(words):
         if not re.match(r"-[A-Za-z_]", name):
             fail(f"'{name}' after -- belongs to no option")
         value = waiting.pop(0) if waiting and not re.match(r"-[A-Za-z_]", waiting[0]) else ""
-        if name == OPTION_FILE:
-            pairs += read_options(found(value) or fail(f"{OPTION_FILE} {value}: there is no such file"))
-        else:
-            pairs.append((name, value))
+        pairs += option(name, value, f"{OPTION_FILE} {value}: there is no such file")
     return pairs
+
+
+def option(name, value, missing):
+    """[(name, value)], or what the option file holds that it names; PETSc's YAML stays a file. missing: what to say where there is none."""
+    if name in OURS:
+        fail(f"{name} is given by tools/breathe itself: leave it out of its options and option files")
+    if name != OPTION_FILE or Path(value).suffix in (".yaml", ".yml", ".json"):
+        return [(name, value)]
+    return read_options(found(value) or fail(missing))
 
 
 def found(value):
@@ -107,9 +117,11 @@ class Case:
                 fail(f"{changed[0]} has changed since {folder} was made of it; name another --case, or --overwrite")
             return case
         folder.mkdir(parents=True, exist_ok=True)
-        for path in folder.iterdir():
-            if path.name != ".lock":
-                shutil.rmtree(path) if path.is_dir() else path.unlink()
+        for path in map(folder.joinpath, MADE):
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
         case = cls.__new__(cls)
         case.folder, case.call, case.made_of, case.done = folder, call, made_of, {}
         for name, what in OPTION_FILES.items():

@@ -56,7 +56,7 @@ def parse(words):
     mask.add_argument("--labels", metavar="PART=NUMBER,...", help="what the labels are, as right=1,left=2,airway=3")
     parser.add_argument("--ranks", type=int, help=f"processes (default: one for every {CELLS_FOR_A_RANK} cells, at most one for each core)")
     parser.add_argument("--dry-run", action="store_true", help="stop after mesh and dry run")
-    parser.add_argument("--overwrite", action="store_true", help="replace what an earlier call with other words left in the folder")
+    parser.add_argument("--overwrite", action="store_true", help="replace what an earlier call with other words left in the folder (files of yours stay)")
     parser.add_argument("--build", type=Path, default=SOURCE / "build", help="build folder (default: build)")
     given = parser.parse_args(words[:cut])
     given.flags = words[cut + 1:]
