@@ -110,15 +110,52 @@ double steps_after(PetscReal t, const Simulation &simulation, const Scene &scene
 Work to_the_end(const Work &work, const Simulation &simulation, const Scene &scene)
 {
   const double left = simulation.at_end() ? 0 : steps_after(simulation.time(), simulation, scene),
-               factor = 1 + left / work.steps;
+               factor = work.steps > 0 ? 1 + left / work.steps : 1;
   return {factor * work.steps, factor * work.newton, factor * work.krylov};
 }
 
-PetscErrorCode print_work(MPI_Comm comm, const char *what, const Work &work, double seconds)
+PetscErrorCode print_work(MPI_Comm comm, const char *what, const Simulation &simulation, double seconds)
 {
+  const Work work = work_of(simulation.rows(), simulation.rows().size());
+
   PetscFunctionBeginUser;
-  PetscCall(PetscPrintf(comm, "  %s: %.0f steps with %.0f Newton steps and %.0f Krylov iterations, in %.3g s.\n", what,
-                        work.steps, work.newton, work.krylov, seconds));
+  PetscCall(PetscPrintf(
+      comm, "  %s: %.0f steps with %.0f Newton steps and %.0f Krylov iterations, in %.3g s; least J %.3g.\n", what,
+      work.steps, work.newton, work.krylov, seconds, (double)simulation.min_J()));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Runs the scene with the cheapest elements for some @p seconds. @p begun: the first steps of the run itself; @p
+/// whole: what it takes to the end, by both.
+PetscErrorCode rehearse_run(const Registry &registry, const Options &options, double seconds, const Work &begun,
+                            Work &whole)
+{
+  const MPI_Comm comm = options.comm();
+  OptionList list;
+  OptionsInForce in_force;
+  bool through;
+
+  PetscFunctionBeginUser;
+  PetscCall(options_of_other_run(options, {{"-elements", cheapest}}, list));
+  PetscCall(in_force.put(list));
+  PetscCall(PetscPrintf(comm, "  rehearsing the run with %s elements ...\n", cheapest));
+  Run other(registry);
+  PetscCall(other.declare());
+  PetscCall(other.setup());
+  Simulation &rehearsal = other.simulation();
+  Budget budget(comm, rehearsal, seconds);
+  rehearsal.heed(budget);
+  PetscCall(rehearsal.run(through));
+  PetscCall(print_work(comm, through ? "The whole run with these" : "The run with these as far as it went", rehearsal,
+                       budget.spent()));
+  if (!through && !rehearsal.stopped())
+    PetscCall(PetscPrintf(comm, "  It could not go on there, and the run itself may not go through: %s\n",
+                          rehearsal.failure_text().c_str()));
+  const Work same_steps = work_of(rehearsal.rows(), static_cast<std::size_t>(begun.steps));
+  if (same_steps.newton == 0 || same_steps.krylov == 0) PetscFunctionReturn(PETSC_SUCCESS);
+  whole = to_the_end(work_of(rehearsal.rows(), rehearsal.rows().size()), rehearsal, other.scene());
+  whole.newton *= begun.newton / same_steps.newton;
+  whole.krylov *= begun.krylov / same_steps.krylov;
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -166,41 +203,16 @@ PetscErrorCode DryRun::make(const Options &options, const Scene &scene, Simulati
   const double first_took = first.spent(), setup = simulation.seconds().setup;
   PulmoFailureCheck(finished || simulation.stopped(), comm, "%s", simulation.failure_text().c_str());
   PetscCall(peak_memory(comm, gigabytes));
-  const std::size_t steps = simulation.rows().size() - 1;
-  const Work begun = work_of(simulation.rows(), steps);
-  PetscCall(print_work(comm, finished ? "The whole run" : "The first steps", begun, first_took));
+  const Work begun = work_of(simulation.rows(), simulation.rows().size());
+  PetscCall(print_work(comm, finished ? "The whole run" : "The first steps", simulation, first_took));
   PetscCall(PetscPrintf(comm, "  %d unknowns, %d tetrahedra, %d rank%s: %.3g GB of memory in all.\n", (int)dofs,
                         (int)scene.mesh().cells(), ranks, ranks > 1 ? "s" : "", gigabytes));
   Work whole = to_the_end(begun, simulation, scene);
-  if (rehearse && !finished) {
-    OptionList list;
-    OptionsInForce in_force;
-    PetscCall(options_of_other_run(options, {{"-elements", cheapest}}, list));
-    PetscCall(in_force.put(list));
-    PetscCall(PetscPrintf(comm, "  rehearsing the run with %s elements ...\n", cheapest));
-    Run other(registry_);
-    PetscCall(other.declare());
-    PetscCall(other.setup());
-    Simulation &rehearsal = other.simulation();
-    Budget rest(comm, rehearsal, (1 - share_of_first_steps) * seconds_);
-    bool through;
-    rehearsal.heed(rest);
-    PetscCall(rehearsal.run(through));
-    PetscCall(print_work(comm, through ? "The whole run with these" : "The run with these as far as it went",
-                         work_of(rehearsal.rows(), rehearsal.rows().size()), rest.spent()));
-    if (!through && !rehearsal.stopped())
-      PetscCall(PetscPrintf(comm, "  It could not go on there, and the run itself may not go through: %s\n",
-                            rehearsal.failure_text().c_str()));
-    const Work same_steps = work_of(rehearsal.rows(), steps);
-    if (same_steps.newton > 0 && same_steps.krylov > 0) {
-      whole = to_the_end(work_of(rehearsal.rows(), rehearsal.rows().size()), rehearsal, other.scene());
-      whole.newton *= begun.newton / same_steps.newton;
-      whole.krylov *= begun.krylov / same_steps.krylov;
-    }
-  }
+  if (rehearse && !finished) PetscCall(rehearse_run(registry_, options, seconds_ - first_took, begun, whole));
   const StageSeconds &s = simulation.seconds();
   const double of_newton = begun.newton > 0 ? (s.residual + s.jacobian) / begun.newton : 0,
-               of_krylov = begun.krylov > 0 ? s.solve / begun.krylov : 0, of_step = s.output / begun.steps,
+               of_krylov = begun.krylov > 0 ? s.solve / begun.krylov : 0,
+               of_step = begun.steps > 0 ? s.output / begun.steps : 0,
                total = setup + whole.newton * of_newton + whole.krylov * of_krylov + whole.steps * of_step;
   if (finished)
     PetscCall(PetscPrintf(comm, "  The run will take about %.3g s, as it just did.\n", total));
