@@ -76,6 +76,7 @@ class Mesh(unittest.TestCase):
         self.assertEqual(rows(self.case / "run"), rows(direct.directory))
         said = f"tidal volume {direct.json()['tidal_volume_ml']:.4g} ml"
         self.assertIn(said, self.made.stdout)
+        self.assertIn(f"peak pressure {direct.json()['peak_inspiratory_pressure_cmH2O']:.4g} cmH2O", self.made.stdout)
 
     def test_the_folder_is_whole(self):
         """It goes elsewhere, without the files that the call named, and run.sh does the same run."""
@@ -88,6 +89,16 @@ class Mesh(unittest.TestCase):
         self.assertEqual(again.returncode, 0, again.stderr)
         self.assertEqual(rows(elsewhere / "again"), rows(self.case / "run"))
         self.assertNotIn(str(self.place), (self.case / "own.opts").read_text())
+
+    def test_the_surroundings_do_not_count(self):
+        """Options of the environment are in no file of the case."""
+        place = folder()
+        shutil.copytree(self.place, place, dirs_exist_ok=True)
+        shutil.rmtree(place / "case/run")
+        made = subprocess.run([TOOL, "case"], capture_output=True, text=True, timeout=300, cwd=place,
+                              env=dict(pulmo.ENVIRONMENT, PETSC_OPTIONS="-tissue ma"))
+        self.assertEqual(made.returncode, 0, made.stderr)
+        self.assertEqual(rows(place / "case/run"), rows(self.case / "run"))
 
     def test_again_does_nothing_twice(self):
         before = os.stat(self.case / "run/summary.json").st_mtime_ns
@@ -199,6 +210,22 @@ class Mistakes(unittest.TestCase):
         (place / "broken").mkdir()
         (place / "broken/case.json").write_text("{")
         self.refused(LUNG, "--case", "full", said="holds other files", cwd=place)
+        self.refused(LUNG, "--case", "full/thesis.txt", said="is a file", cwd=place)
+        self.refused(LUNG, "--case", "broken", "--overwrite", said="damaged", cwd=place)
+        (place / "self.opts").write_text("-options_file self.opts\n")
+        (place / "two.opts").write_text("-tissue birzle -airflow\n")
+        (place / "latin.opts").write_bytes(b"-tissue birzle # \xe4\n")
+        for name, said in (("self.opts", "names itself"), ("two.opts", "holds two options"), ("latin.opts", "UTF-8")):
+            self.refused(LUNG, "--mode", name, said=said, cwd=place)
+        (place / "old").mkdir()
+        made = called(LUNG, *QUICK, "--case", "old", "--dry-run", cwd=place)
+        self.assertEqual(made.returncode, 0, made.stderr)
+        self.refused("old/lung.msh", "--case", "old", "--overwrite", said="lies in", cwd=place)
+        self.assertTrue((place / "old/lung.msh").exists())
+        with open(place / "old/own.opts", "a") as f:  # what no call would write
+            f.write("-scene_view_only\n")
+        ended = called("old", cwd=place)
+        self.assertEqual((ended.returncode, "without a result" in ended.stderr), (1, True), ended.stderr)
         self.refused("broken", said="damaged", cwd=place)
         self.assertEqual((place / "full/thesis.txt").read_text(), "mine")
 

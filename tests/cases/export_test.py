@@ -28,6 +28,11 @@ def export(*arguments):
     return made.returncode, made.stdout, made.stderr
 
 
+def files_in(folder):
+    """Names in their order, but for the list of what an export made."""
+    return sorted(name for name in os.listdir(folder) if name != ".made_by_export")
+
+
 def image(values, affine, unit="mm"):
     """Path of a new NIfTI image."""
     made = nibabel.Nifti1Image(values, affine)
@@ -68,7 +73,7 @@ class Made(unittest.TestCase):
         folder = pulmo.scratch("export")
         code, out, err = export(run or self.made, "--output", folder, "--format", *arguments)
         self.assertEqual(code, 0, err)
-        self.assertEqual(sorted(os.listdir(folder)), sorted(os.path.basename(line.split()[-1]) for line in out.splitlines() if " wrote " in line))
+        self.assertEqual(files_in(folder), sorted(os.path.basename(line.split()[-1]) for line in out.splitlines() if " wrote " in line))
         return folder, out
 
     def read(self, folder, name):
@@ -80,7 +85,7 @@ class Made(unittest.TestCase):
         folder, said = self.export("nifti", "--grid", grid)
         self.assertIn("times: 0 s (start of the breath); 1 s (end of inspiration)", said)
         self.assertIn("only the boxes of lung and image were compared", said)
-        self.assertEqual(sorted(os.listdir(folder)), sorted(["lung.nii.gz", *(f"{n}_{t}s.nii.gz" for n in DEFAULT for t in (0, 1))]))
+        self.assertEqual(files_in(folder), sorted(["lung.nii.gz", *(f"{n}_{t}s.nii.gz" for n in DEFAULT for t in (0, 1))]))
         x = places(affine, (45, 60, 25))
         lung = self.read(folder, "lung")
         self.assertEqual(lung.get_data_dtype(), np.uint8)
@@ -130,7 +135,7 @@ class Made(unittest.TestCase):
         self.assertTrue((lung.get_fdata() > 0)[in_box(x, 1e-3)].all())
         self.assertFalse((lung.get_fdata() > 0)[~in_box(x, -1e-3)].any())
         self.assertEqual(lung.get_fdata().sum() * 2.5**3, np.prod(made_run.LENGTHS))
-        self.assertEqual(sorted(os.listdir(folder)), ["J_mean_0s.nii.gz", "J_mean_1s.nii.gz", "lung.nii.gz"])
+        self.assertEqual(files_in(folder), ["J_mean_0s.nii.gz", "J_mean_1s.nii.gz", "lung.nii.gz"])
 
     def test_an_image_in_metres(self):
         affine = turned(0.0, (0.002, 0.002, 0.002), (0.09, -0.03, 0.0))
@@ -194,6 +199,13 @@ class Made(unittest.TestCase):
                            ((9, 9, 9), (9, 9), (9, 9, 9)))
         with open(text, "w") as out:
             out.write("no image")
+        huge = pulmo.scratch("huge.nii")  # a header alone
+        head = nibabel.Nifti1Header()
+        head.set_data_shape((30000, 30000, 3000))
+        head.set_data_dtype(np.uint8)
+        head.set_sform(np.eye(4), 1)
+        with open(huge, "wb") as out:
+            head.write_to(out)
         failed, working, empty = (self.copy() for _ in range(3))
         for folder in failed, working:
             os.rename(os.path.join(folder, "signals.csv"), os.path.join(folder, "signals.csv.part"))
@@ -238,6 +250,23 @@ class Made(unittest.TestCase):
         self.assertFalse(os.path.exists(folder))
         said = self.export("vtu", "--unfinished", run=failed)[1]
         self.assertIn("WARNING: FAILED: steps only crawl", said)
+
+    def test_files_of_the_user_stay(self):
+        folder = pulmo.scratch("export")
+        os.makedirs(folder)
+        mine = os.path.join(folder, "lung.nii.gz")
+        os.rename(image(np.zeros((45, 30, 20), np.int16), turned(0, (2.0, 2.0, 2.0), (90, -30, 0))), mine)
+        with open(mine, "rb") as f:
+            before = f.read()
+        for grid in ["--grid", mine], ["--spacing", "5"]:
+            code, _, err = export(self.made, "--format", "nifti", *grid, "--fields", "J", "--output", folder)
+            self.assertEqual((code, os.listdir(folder)), (1, ["lung.nii.gz"]), err)
+            self.assertIn("lung.nii.gz is there and no export made it", err)
+        with open(mine, "rb") as f:
+            self.assertEqual(f.read(), before)
+        os.remove(mine)
+        for _ in range(2):  # its own files are replaced
+            self.assertEqual(export(self.made, "--format", "nifti", "--spacing", "5", "--fields", "J", "--output", folder)[0], 0)
 
     def copy(self):
         folder = pulmo.scratch("copy")

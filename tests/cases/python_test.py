@@ -101,9 +101,31 @@ class Module(unittest.TestCase):
                             (lambda: pulmo.run("pcv", "lungs"), "there is no mesh lungs: .* lung_test"),
                             (lambda: pulmo.load(case.scratch()), "there is no directory"),
                             (lambda: pulmo.sweep({}, "pcv", "lung_test"), "nothing to vary"),
-                            (lambda: pulmo.sweep({"ts_dt": [1]}, "pcv", "lung_test", ts_dt=1), "both varied and given")):
+                            (lambda: pulmo.sweep({"ts_dt": [1]}, "pcv", "lung_test", ts_dt=1), "both varied and given"),
+                            (lambda: pulmo.sweep({"ventilator_pip": "68"}, "pcv", "lung_test"), "ventilator_pip has no list"),
+                            (lambda: pulmo.sweep({"ventilator_pip": 6}, "pcv", "lung_test"), "ventilator_pip has no list"),
+                            (lambda: pulmo.sweep({"mesh": ["a", "b"]}, "pcv", "lung_test"), "mesh is no option"),
+                            (lambda: pulmo.run("pcv", "lung_test", output_dir="mine"), "argument directory"),
+                            (lambda: pulmo.run("pcv", "lung_test", dry_run=True), "makes no run"),
+                            (lambda: pulmo.run("pcv", "lung_test", ranks=0), "ranks is the number"),
+                            (lambda: pulmo.run([], "lung_test"), "needs a scene")):
             with self.assertRaisesRegex(pulmo.PulmoError, words):
                 call()
+
+    def test_a_cut_file_is_no_run(self):
+        """One that ends before the summary does, and one that is no object."""
+        cut = case.scratch("cut")
+        shutil.copytree(self.case.directory, cut)
+        with open(os.path.join(cut, "signals.csv")) as f:
+            lines = f.readlines()
+        with open(os.path.join(cut, "signals.csv"), "w") as f:
+            f.writelines(lines[:len(lines) // 2])
+        with self.assertRaisesRegex(pulmo.PulmoError, "it is cut"):
+            pulmo.load(cut)
+        with open(os.path.join(cut, "summary.json"), "w") as f:
+            f.write("[]")
+        with self.assertRaisesRegex(pulmo.PulmoError, "summary.json is damaged"):
+            pulmo.load(cut)
 
     def test_sweep(self):
         table = pulmo.sweep({"ventilator_pip": [6, 8], "snes_max_it": [20, 1]}, "pcv", "lung_test", ts_max_time=None, **FAST)

@@ -15,21 +15,30 @@ OPTION_FILES = {"scene": "the scene: mode and effects", "solver": "the solver", 
 # what a call leaves in its folder; anything else is the user's
 MADE = ("case.json", "lung.msh", "mesh.html", "mesh.txt", "inputs", "accuracy", "accuracy.txt", "accuracy.opts", "dry_run.txt", "run", "run.sh",
         "pulmo.log", "report.html", *(f"{name}.opts" for name in OPTION_FILES))
-OURS = ("-dm_plex_filename", "-output_dir", "-output_overwrite", "-restart", "-dry_run", "-scene_view_only", "-help", "-progress")  # breathe gives these
+OURS = ("-dm_plex_filename", "-output_dir", "-output_overwrite", "-restart", "-dry_run", "-scene_view_only", "-help", "-list", "-version", "-progress")  # breathe gives these
 
 
-def read_options(path):
-    """[(name, value)] of an option file, those of files that it names in their place. A line without a dash (alias) is a name of its own."""
-    pairs = []
-    for line in Path(path).read_text(encoding="utf-8-sig").splitlines():
+def read_options(path, within=()):
+    """[(name, value)] of an option file, those of files that it names in their place. A line without a dash (alias) is a name of its own.
+    within: the files that name this one."""
+    pairs, within = [], (*within, Path(path).resolve())
+    if len(set(within)) < len(within):
+        fail(f"{path} names itself as an option file, at once or by others")
+    try:
+        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
+    except (UnicodeDecodeError, OSError) as error:
+        fail(f"{path} is no option file: {'it is no text in UTF-8' if isinstance(error, UnicodeDecodeError) else error.strerror}")
+    for line in lines:
         line = line.strip()
         if not line.startswith("-"):
             pairs += [(re.sub(r"\s#.*", "", line), "")] if line and line[0] != "#" else []
             continue
         name, value = re.match(r"""(\S+)\s*("[^"]*"|'[^']*'|.*?)\s*(?:(?<=\s)#.*)?$""", line).groups()
-        if value[:1] == value[-1:] and value[:1] in ("'", '"'):
+        if len(value) > 1 and value[:1] == value[-1:] and value[:1] in ("'", '"'):
             value = value[1:-1]
-        pairs += option(name, value, f"{path} names an option file {value}, which is not there")
+        elif re.search(r"\s-[A-Za-z]", value):
+            fail(f"{path}: '{name} {value}' holds two options; give each a line of its own, or put the value in quotes")
+        pairs += option(name, value, within, f"{path} names an option file {value}, which is not there")
     return pairs
 
 
@@ -41,17 +50,17 @@ def pairs_of(words):
         if not re.match(r"-[A-Za-z_]", name):
             fail(f"'{name}' after -- belongs to no option")
         value = waiting.pop(0) if waiting and not re.match(r"-[A-Za-z_]", waiting[0]) else ""
-        pairs += option(name, value, f"{OPTION_FILE} {value}: there is no such file")
+        pairs += option(name, value, (), f"{OPTION_FILE} {value}: there is no such file")
     return pairs
 
 
-def option(name, value, missing):
+def option(name, value, within, missing):
     """[(name, value)], or what the option file holds that it names; PETSc's YAML stays a file. missing: what to say where there is none."""
     if name in OURS:
         fail(f"{name} is given by tools/breathe itself: leave it out of its options and option files")
     if name != OPTION_FILE or Path(value).suffix in (".yaml", ".yml", ".json"):
         return [(name, value)]
-    return read_options(found(value) or fail(missing))
+    return read_options(found(value) or fail(missing), within)
 
 
 def found(value):
@@ -62,11 +71,11 @@ def found(value):
     return None
 
 
-def file_of(value):
-    """(file, rest) of a value that names a file as FILE or FILE:dataset; (None, value) else. A word without a dot or a slash is
-    a name, though a file may be called so."""
+def file_of(option, value):
+    """(file, rest) of an option's value that names a file as FILE or FILE:dataset; (None, value) else. A word without a dot or a slash is
+    a name, though a file may be called so, unless the option wants a file."""
     for name, rest in ((value, ""), (value.rpartition(":")[0], ":" + value.rpartition(":")[2])):
-        if re.search(r"[./]", name) and found(name):
+        if (re.search(r"[./]", name) or option.endswith(("_programme", "_file"))) and found(name):
             return found(name), rest
     return None, value
 
@@ -85,7 +94,7 @@ def digest_of_source(path):
 
 def digest_of_options(pairs):
     """Of options and of the files that they name."""
-    lines = [f"{name} {value} {digest(file_of(value)[0]) if file_of(value)[0] else ''}\n" for name, value in pairs]
+    lines = [f"{name} {value} {digest(file_of(name, value)[0]) if file_of(name, value)[0] else ''}\n" for name, value in pairs]
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
@@ -97,8 +106,8 @@ class Case:
         try:
             known = json.loads((self.folder / "case.json").read_text())
             self.call, self.made_of, self.done = known["call"], known["made_of"], known["done"]
-        except (ValueError, KeyError):
-            fail(f"{self.folder / 'case.json'} is damaged; give the mask or mesh again with --overwrite")
+        except (ValueError, KeyError, TypeError, OSError):
+            fail(f"{self.folder / 'case.json'} is damaged, or not of tools/breathe: name another --case")
 
     @classmethod
     def take(cls, folder, call, source, words, overwrite):
@@ -117,8 +126,14 @@ class Case:
                 fail(f"{changed[0]} has changed since {folder} was made of it; name another --case, or --overwrite")
             return case
         folder.mkdir(parents=True, exist_ok=True)
+        if (folder / "case.json").exists():
+            cls(folder)  # of breathe, or no word of replacing it
+        named = [source, *(file_of(name, value)[0] for pairs in options.values() for name, value in pairs)]
+        inside = [path for path in named if path and folder.resolve() in Path(path).resolve().parents]
+        if inside:
+            fail(f"{inside[0]} lies in {folder}, which is made anew: name another --case")
         for path in map(folder.joinpath, MADE):
-            if path.is_dir():
+            if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path)
             else:
                 path.unlink(missing_ok=True)
@@ -133,7 +148,7 @@ class Case:
         """An option file of the case. Files that options name are copied into inputs/, for the folder to be whole."""
         lines = [f"# {what}"]
         for option, value in pairs:
-            path, dataset = file_of(value)
+            path, dataset = file_of(option, value)
             if path:
                 value = self.keep(path) + dataset
             quoted = f'"{value}"' if re.search(r"\s", value) or re.match(r"-[A-Za-z]", value) else value
@@ -162,9 +177,9 @@ class Case:
     def options(self):
         """What pulmo is told in this folder, without launcher and output."""
         files = [f"{name}.opts" for name in (*OPTION_FILES, "accuracy") if (self.folder / f"{name}.opts").exists()]
-        return ["-dm_plex_filename", self.done["mesh"]["file"], *(word for name in files for word in (OPTION_FILE, name))]
+        return ["-skip_petscrc", *(word for name in files for word in (OPTION_FILE, name)), "-dm_plex_filename", self.done["mesh"]["file"]]
 
-    def inputs(self):
-        """Hashes of all that a run reads: what changes any of them makes another run."""
-        files = [self.folder / self.done["mesh"]["file"], *sorted(self.folder.glob("*.opts")), *sorted(self.folder.glob("inputs/*"))]
-        return {str(path.relative_to(self.folder)): digest(path) for path in files}
+    def inputs(self, program):
+        """Hashes of all that a run is made of, the program's own with them: what changes any of them makes another run."""
+        files = [program, self.folder / self.done["mesh"]["file"], *sorted(self.folder.glob("*.opts")), *sorted(self.folder.glob("inputs/*"))]
+        return {path.name if path == program else str(path.relative_to(self.folder)): digest(path) for path in files}

@@ -14,11 +14,11 @@ import shlex
 import sys
 from pathlib import Path
 
-from shared.common import SCENES, SOLVERS, SOURCE, fail, listed, offered
+from shared.common import SCENES, SOLVERS, SOURCE, fail, listed, offered, require
 from shared.keys import lock
 
 from . import stages
-from .case import Case
+from .case import Case, digest_of_source
 
 NUMBERS = {"tidal_volume": "ml", "pip": "cmH2O", "peep": "cmH2O", "inspiration": "s", "expiration": "s", "breaths": ""}
 FOR_MASKS = ("volume", "size", "cells", "labels")  # options that go to tools/lung_mesh
@@ -48,7 +48,7 @@ def parse(words):
     parser.add_argument("--solver", default="iterative", help="a file of petsc_options/solvers (default: iterative)")
     parser.add_argument("--within", metavar="NAME=1%", help=(
         "look first for mesh, steps and elements that give a number to this accuracy (tools/accuracy_cost), and run with them"))
-    parser.add_argument("--budget", default="30min", help="time that this search may take (default: 30min)")
+    parser.add_argument("--budget", help="time that this search may take (default: 30min)")
     mask = parser.add_argument_group("of a mask (tools/lung_mesh)")
     mask.add_argument("--volume", metavar="ML", help="volume of the lungs at rest, as 2500ml (default: the scan's)")
     mask.add_argument("--size", metavar="MM", help="edge of the cells")
@@ -62,12 +62,14 @@ def parse(words):
     given.flags = words[cut + 1:]
     if given.ranks is not None and given.ranks < 1:
         fail("--ranks must be at least 1")
+    if given.budget and not given.within:
+        fail("--budget limits the search of --within: give both, or neither")
     return given
 
 
 def scene_file(name):
     """The option file that --mode names."""
-    for path in (Path(name), SCENES / f"{name}.opts"):
+    for path in (SCENES / f"{name}.opts", Path(name)):
         if path.is_file():
             return path
     fail(f"--mode {name} is no option file, and no scene of petsc_options/scenes: {', '.join(sorted(p.stem for p in SCENES.glob('*.opts')))}")
@@ -100,7 +102,7 @@ def own_words(given):
 
 
 def solver_file(name):
-    for path in (Path(name), SOLVERS / f"{name}.opts"):
+    for path in (SOLVERS / f"{name}.opts", Path(name)):
         if path.is_file():
             return path
     fail(f"--solver {name} is no option file, and none of petsc_options/solvers: {', '.join(sorted(p.stem for p in SOLVERS.glob('*.opts')))}")
@@ -116,16 +118,19 @@ def begin(words):
     """The case that the words of a call ask for, made or taken up again."""
     given = parse(words)
     if (given.source / "case.json").is_file():
-        case = Case(given.source)
+        case, dry = Case(given.source), given.dry_run
         more = [word for word in words if word != "--dry-run" and Path(word) != given.source]
         if more:
             fail(f"{given.source} is the folder of an earlier call, which goes on as it was called: leave out {' '.join(more)}, or give the mask or mesh again")
         lock(case.folder)
-        return case, parse(case.call), given.dry_run
+        given = parse(case.call)
+        require(given.build, [])
+        if "mesh" not in case.done and not (given.source.exists() and digest_of_source(given.source) == case.made_of["source"]):
+            fail(f"{given.source}, which {case.folder} is to be made of, is not there any more, or has changed: give it again with --overwrite")
+        return case, given, dry
     if not given.source.exists():
         fail(f"there is no {given.source}: give a label image, a folder of them, a mesh (.msh) or the folder of an earlier call")
-    if not (given.build / "pulmo").exists():
-        fail(f"{given.build} holds no build; run tools/setup first")
+    require(given.build, [])
     is_mesh = given.source.suffix == ".msh"
     if not is_mesh and not given.source.is_dir() and not given.source.name.endswith((".nii", ".nii.gz")):
         fail(f"{given.source} is no label image (.nii, .nii.gz) and no mesh (.msh); tools/lung_mesh --convert makes one of other formats")
@@ -137,14 +142,25 @@ def begin(words):
     words_of = {"scene": scene_words(given), "solver": ["-options_file", str(solver_file(given.solver))], "own": own_words(given)}
     mode = given.mode if (SCENES / f"{given.mode}.opts").is_file() else stem(Path(given.mode))
     folder = given.case or Path("results") / f"{stem(given.source)}-{mode}"
+    if folder.exists() and not folder.is_dir():
+        fail(f"--case {folder} is a file: name a folder")
     if folder.exists() and not (folder / "case.json").exists() and any(folder.iterdir()):
         fail(f"--case {folder} holds other files: name a new folder")
     lock(folder)
-    absolute = [str(given.source.resolve()) if word == str(given.source) else word for word in words if word not in ("--dry-run", "--overwrite")]
+    places = {given.source, given.build}
+    absolute = [str(Path(word).resolve()) if Path(word) in places else word for word in words if word not in ("--dry-run", "--overwrite")]
     return Case.take(folder, absolute, given.source, words_of, given.overwrite), given, given.dry_run
 
 
 def main(words):
+    try:
+        return make(words)
+    except OSError as error:
+        fail(f"{error.filename or 'a file'} cannot be read or written ({error.strerror}); what was finished is kept")
+
+
+def make(words):
+    """Carries out a call; returns the exit code."""
     case, given, only_dry = begin(words)
     print(f"breathe: all of it goes into {case.folder}", flush=True)
     try:

@@ -13,6 +13,7 @@ from shared.common import SOURCE, environment, fail
 
 from .progress import Progress
 
+BUDGET = "30min"
 PULMO_STOPPED = 3  # exit code: there is a checkpoint to go on from
 
 
@@ -31,6 +32,11 @@ def told(command, log, what, **place):
         fail(f"{what} failed, see above")
 
 
+def surroundings():
+    """The environment without options of PETSc's: what counts is in the case."""
+    return {name: value for name, value in environment().items() if not name.startswith("PETSC_OPTIONS")}
+
+
 def mesh(case, given):
     """lung.msh in the case: made of the mask, or a copy of the mesh, checked."""
     if "mesh" in case.done:
@@ -41,7 +47,7 @@ def mesh(case, given):
     page = ["--report", case.folder / "mesh.html"]
     if given.source.suffix == ".msh":
         say(f"checking {given.source}")
-        check = subprocess.run([tool, "--check", given.source, *map(str, page)], capture_output=True, text=True, env=environment())
+        check = subprocess.run([tool, "--check", given.source.resolve(), *map(str, page)], capture_output=True, text=True, env=environment())
         log.write_text(check.stdout + check.stderr)
         print("".join(f"  {line}\n" for line in (check.stdout + check.stderr).splitlines()), end="")
         if check.returncode:
@@ -51,7 +57,7 @@ def mesh(case, given):
         say(f"making a mesh of {given.source}")
         more = [word for option in ("volume", "size", "cells", "labels") if getattr(given, option)
                 for word in (f"--{option}", getattr(given, option))]
-        told([tool, "--mask", given.source, "--output", to, *page, *more], log, "tools/lung_mesh")
+        told([tool, "--mask", given.source.resolve(), "--output", to, *page, *more], log, "tools/lung_mesh")
     case.save(mesh={"file": to.name, "seconds": round(time.monotonic() - begun, 1), "source": str(given.source)})
 
 
@@ -75,9 +81,9 @@ def accuracy(case, given):
     if "accuracy" in case.done:
         return
     begun = time.monotonic()
-    say(f"looking for what gives {given.within}, in at most {given.budget}")
+    say(f"looking for what gives {given.within}, in at most {given.budget or BUDGET}")
     folder = case.folder / "accuracy"
-    command = [SOURCE / "tools/accuracy_cost", "scene.opts", "--meshes", case.done["mesh"]["file"], "--question", given.within, "--budget", given.budget,
+    command = [SOURCE / "tools/accuracy_cost", "scene.opts", "--meshes", case.done["mesh"]["file"], "--question", given.within, "--budget", given.budget or BUDGET,
                "--build", given.build.resolve(), "--output", "accuracy", "--solvers", "solver.opts", "--", "-options_file", "own.opts"]
     told(command, case.folder / "accuracy.txt", "tools/accuracy_cost", cwd=case.folder)
     recommended = sorted(folder.glob("recommended_*.opts"))
@@ -91,12 +97,12 @@ def accuracy(case, given):
 
 def dry_run(case, given, ranks):
     """The scene in words, what it takes; pulmo's checks. Ends the program if pulmo refuses it."""
-    inputs = case.inputs()
+    inputs = case.inputs(given.build / "pulmo")
     if case.done.get("dry_run", {}).get("inputs") == inputs:
         return
     begun = time.monotonic()
     log = case.folder / "dry_run.txt"
-    run = subprocess.run([*launched(given, ranks), *case.options, "-dry_run"], cwd=case.folder, env=environment(), capture_output=True, text=True)
+    run = subprocess.run([*launched(given, ranks), *case.options, "-dry_run"], cwd=case.folder, env=surroundings(), capture_output=True, text=True)
     log.write_text(run.stdout + run.stderr)
     print(run.stdout, end="")
     if run.returncode:  # without what the launcher has to say
@@ -109,7 +115,7 @@ def dry_run(case, given, ranks):
 
 def run(case, given, ranks):
     """The run in run/; its exit code. One that was stopped goes on from its checkpoint."""
-    inputs, folder = case.inputs(), case.folder / "run"
+    inputs, folder = case.inputs(given.build / "pulmo"), case.folder / "run"
     if case.done.get("run", {}).get("code") == 0 and case.done["run"]["inputs"] == inputs and (folder / "summary.json").exists():
         say("the run is there already")
         return 0
@@ -133,6 +139,8 @@ def run(case, given, ranks):
     case.save(run={"inputs": inputs, "code": None, "ranks": ranks})
     code = execute(command, case)
     case.save(run={"inputs": inputs, "code": code, "ranks": ranks, "seconds": round(time.monotonic() - begun, 1)})
+    if code == 0 and not (folder / "summary.json").exists():
+        fail(f"pulmo ended without a result: an option of {case.folder}/*.opts asks for something else than a run")
     if code == PULMO_STOPPED:
         say(f"stopped; {shlex.join(['tools/breathe', str(case.folder)])} goes on from its checkpoint")
     return code
@@ -142,7 +150,7 @@ def execute(command, case):
     """Runs pulmo with a bar; what it prints goes to pulmo.log. A signal is passed on, so that pulmo leaves a checkpoint."""
     progress = Progress()
     with open(case.folder / "pulmo.log", "a") as log:
-        process = subprocess.Popen(command, cwd=case.folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment(),
+        process = subprocess.Popen(command, cwd=case.folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=surroundings(),
                                    start_new_session=True)
         former = {s: signal.signal(s, lambda number, _: process.send_signal(number)) for s in (signal.SIGINT, signal.SIGTERM)}
         try:
@@ -176,8 +184,8 @@ def tell(case, code):
     summary = case.folder / "run/summary.json"
     if code == 0 and summary.exists():
         numbers = json.loads(summary.read_text())
-        shown = [("tidal volume", "tidal_volume_ml", "ml"), ("peak pressure", "peak_pressure_cmH2O", "cmH2O"),
+        shown = [("tidal volume", "tidal_volume_ml", "ml"), ("peak pressure", "peak_inspiratory_pressure_cmH2O", "cmH2O"),
                  ("compliance", "compliance_ml_per_cmH2O", "ml/cmH2O"), ("resistance", "resistance_cmH2O_s_per_l", "cmH2O s/l")]
-        say("; ".join(f"{words} {numbers[key]:.4g} {unit}" for words, key, unit in shown if isinstance(numbers.get(key), float)))
+        say("; ".join(f"{words} {numbers[key]:.4g} {unit}" for words, key, unit in shown if isinstance(numbers.get(key), (int, float))))
     if (case.folder / "report.html").exists():
         say(f"open {case.folder / 'report.html'} in a browser")

@@ -3,12 +3,14 @@ import contextlib
 import os
 import shutil
 import tempfile
+from pathlib import Path
 
 from pulmo.errors import PulmoError
 from pulmo.files import RunFiles
 
 FORMATS = ["nifti", "vtu", "paraview", "ventilator_csv"]
 NEAR = 1e-6  # s
+LIST = ".made_by_export"  # names of the files in a folder that may be replaced
 
 
 def say(text):
@@ -69,8 +71,9 @@ def moments_of(run, text, kind):
 
 
 @contextlib.contextmanager
-def scratch(output):
-    """A folder within `output` whose files go there when all is done, and away if not."""
+def scratch(output, read):
+    """A folder within `output` whose files go there when all is done, and away if not. Files that stand there are replaced if an
+    export made them (LIST names those), and no file that was `read`."""
     new = not os.path.isdir(output)
     try:
         os.makedirs(output, exist_ok=True)
@@ -79,7 +82,14 @@ def scratch(output):
         raise PulmoError(f"cannot write {output}: {error.strerror}") from None
     try:
         yield part
-        for name in os.listdir(part):
+        made, listed = sorted(os.listdir(part)), os.path.join(output, LIST)
+        earlier = Path(listed).read_text().splitlines() if os.path.isfile(listed) else []
+        for name in made:
+            to = os.path.join(output, name)
+            if os.path.lexists(to) and (name not in earlier or os.path.isdir(to) or any(os.path.exists(r) and os.path.samefile(to, r) for r in read)):
+                raise PulmoError(f"{to} is there and no export made it: move it, or name another --output")
+        Path(part, LIST).write_text("".join(f"{name}\n" for name in sorted({*earlier, *made})))
+        for name in [LIST, *made]:
             os.replace(os.path.join(part, name), os.path.join(output, name))
     except OSError as error:
         raise PulmoError(f"cannot write {output}: {error.strerror or error}") from None
@@ -96,7 +106,7 @@ def export(given):
     run = read(given.directory, given.unfinished)
     given.output = given.output or os.path.join(given.directory, "export")
     made = []
-    with scratch(given.output) as folder:
+    with scratch(given.output, [path for path in (given.grid, given.labels) if path]) as folder:
         for kind in dict.fromkeys(given.format):
             if kind == "nifti":
                 from .nifti import export as write

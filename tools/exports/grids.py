@@ -67,14 +67,16 @@ def of_image(path, say):
     scaled = np.diag([UNITS[unit]] * 3 + [1.0]) @ affine
     if not np.isfinite(scaled).all() or abs(np.linalg.det(scaled[:3, :3])) < 1e-9:
         raise PulmoError(f"--grid {path}: its affine matrix is singular or not finite, so its voxels have no place")
+    if np.prod(np.array(shape[:3], float)) > MOST_VOXELS:
+        raise PulmoError(f"--grid {path} has {np.prod(np.array(shape[:3], float)):.2g} voxels; it takes at most {MOST_VOXELS:.0e}")
     return Grid(tuple(int(n) for n in shape[:3]), scaled, path, affine, unit, codes)
 
 
 def regular(low, high, spacing):
     """A Grid along the world's axes around a box (mm), with a margin of one voxel."""
     low = np.floor(low / spacing) * spacing - spacing
-    shape = np.ceil((high - low) / spacing).astype(np.int64) + 2
-    if np.prod(shape) > MOST_VOXELS:
+    shape = np.ceil((high - low) / spacing) + 2
+    if not np.prod(shape) <= MOST_VOXELS:
         raise PulmoError(f"--spacing {spacing:g} makes {np.prod(shape):.2g} voxels; give a larger one")
     affine = np.diag([spacing] * 3 + [1.0])
     affine[:3, 3] = low

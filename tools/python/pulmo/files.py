@@ -37,11 +37,14 @@ def of_json(directory, name):
     path = os.path.join(directory, name)
     try:
         with open(path) as f:
-            return json.load(f)
+            said = json.load(f)
     except FileNotFoundError:
         return None
     except ValueError as error:
         raise PulmoError(f"{path} is damaged: {error}") from None
+    if not isinstance(said, dict) or not isinstance(said.get("options", {}), dict):
+        raise PulmoError(f"{path} is damaged: it is not what pulmo writes there")
+    return said
 
 
 def read_summary(directory, end):
@@ -62,6 +65,9 @@ class RunFiles:
         self.signals = numbers_of(signals_path(self.directory))
         self.time = self.signals["time_s"]
         self.summary, self.unfinished = read_summary(self.directory, self.time[-1])
+        if "end_time_s" in self.summary and abs(self.time[-1] - self.summary["end_time_s"]) > 1e-6 * max(1, abs(self.summary["end_time_s"])):
+            raise PulmoError(f"{signals_path(self.directory)} ends at {self.time[-1]:g} s and the run at {self.summary['end_time_s']:g} s: it is cut, "
+                             "or of another run")
         self.state = "failed" if self.unfinished and self.summary else "unfinished" if self.unfinished else "finished"
         self.scene = of_json(self.directory, "scene.json") or {}
         self.options = self.summary.get("options") or self.scene.get("options") or {}

@@ -13,6 +13,8 @@ from .run import Run
 from .tables import pandas
 
 SOURCE = Path(__file__).resolve().parents[3]  # of the project, or share/pulmo of an installation
+OURS = {"output_dir": "directory", "dm_plex_filename": "mesh", "options_file": "scene"}  # options that arguments stand for
+OTHER_THAN_RUNS = ("dry_run", "scene_view_only", "help", "list", "version")
 _kept = []  # the folder of runs that no directory was given for
 
 
@@ -46,6 +48,13 @@ def _words(options):
     """Words of the command line for {name: value}: True and False are on and off, None leaves an option out, lists get commas."""
     words = []
     for name, value in options.items():
+        own = name.lstrip("-")
+        if own in OURS:
+            raise PulmoError(f"{own} is the argument {OURS[own]}: give it there")
+        if own in OTHER_THAN_RUNS:
+            raise PulmoError(f"{own} makes no run: call the program itself for it")
+        if hasattr(value, "tolist"):  # of numpy
+            value = value.tolist()
         if value is None:
             continue
         if isinstance(value, bool):
@@ -67,7 +76,11 @@ def _reason(error, output, code):
 
 def command(scene, mesh, solver="iterative", ranks=1, directory=None, **options):
     """The words of the command that run() runs: a list of str."""
-    scenes = [scene] if isinstance(scene, (str, os.PathLike)) else list(scene)
+    scenes = [scene] if isinstance(scene, (str, os.PathLike)) else list(scene or [])
+    if not scenes or not isinstance(mesh, (str, os.PathLike)):
+        raise PulmoError("a run needs a scene (a name, a file or a list of them) and a mesh (a name or a file)")
+    if isinstance(ranks, bool) or not isinstance(ranks, int) or ranks < 1:
+        raise PulmoError(f"ranks is the number of processes, 1 or more, not {ranks!r}")
     words = ["mpiexec", "-n", str(ranks)] if ranks > 1 else []
     words += [_program(), "-dm_plex_filename", _file(mesh, "meshes", ".msh", "mesh")]
     for name, folder, what in [(solver, "solvers", "solver")] + [(name, "scenes", "scene") for name in scenes]:
@@ -103,8 +116,15 @@ def sweep(values, scene, mesh, *, directory=None, **arguments):
     Columns: the options that vary, the overall clinical numbers (Run.numbers), `directory`, and `failure`: "" or why that run did
     not reach its end; its numbers are NaN then, and the others go on. A combination that is wrong input raises RunFailed at once.
     """
+    one = next((name for name, some in values.items() if isinstance(some, str) or not hasattr(some, "__len__")), None) if isinstance(values, dict) else ""
+    if one is not None:
+        raise PulmoError("sweep: give {option: [value, value, ...]}" + (f"; {one} has no list of values" if one else ""))
+    values = {name: some.tolist() if hasattr(some, "tolist") else list(some) for name, some in values.items()}
     if not values or not all(values.values()):
         raise PulmoError("sweep: there is nothing to vary; give {option: [value, value, ...]}")
+    ours = sorted(set(values) & {"scene", "mesh", "directory", "solver", "ranks"})
+    if ours:
+        raise PulmoError(f"sweep: {ours[0]} is no option of the program; call sweep once for each")
     both = sorted(set(values) & set(arguments))
     if both:
         raise PulmoError(f"sweep: {both[0]} is both varied and given")
