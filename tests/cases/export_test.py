@@ -104,7 +104,7 @@ class Made(unittest.TestCase):
         np.testing.assert_allclose(J[sure], np.where(side > 0, 1.5, 1.1)[sure], atol=1e-6)
         for name in DEFAULT:
             self.assertEqual(np.abs(self.read(folder, name + "_1s").get_fdata()[~inside]).max(), 0)
-        for name in os.listdir(folder):
+        for name in files_in(folder):
             made = nibabel.load(os.path.join(folder, name))
             np.testing.assert_allclose(made.affine, nibabel.load(grid).affine, atol=1e-5)
             np.testing.assert_allclose(made.get_qform(), nibabel.load(grid).affine, atol=1e-4)
