@@ -10,12 +10,11 @@ from shared.common import SOURCE, fail, written_whole
 
 OPTION_FILE = "-options_file"
 OPTION_FILES = {"scene": "the scene: mode and effects", "solver": "the solver", "own": "numbers and options of the call, which override what stands before"}
-
-
 # what a call leaves in its folder; anything else is the user's
 MADE = ("case.json", "lung.msh", "mesh.html", "mesh.txt", "inputs", "accuracy", "accuracy.txt", "accuracy.opts", "dry_run.txt", "run", "run.sh",
         "pulmo.log", "report.html", *(f"{name}.opts" for name in OPTION_FILES))
-OURS = ("-dm_plex_filename", "-output_dir", "-output_overwrite", "-restart", "-dry_run", "-scene_view_only", "-help", "-list", "-version", "-progress")  # breathe gives these
+# what breathe gives itself, or what would make no run
+OURS = ("-dm_plex_filename", "-output_dir", "-output_overwrite", "-restart", "-dry_run", "-scene_view_only", "-help", "-list", "-version", "-progress")
 
 
 def read_options(path, within=()):

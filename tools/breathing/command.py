@@ -21,7 +21,6 @@ from . import stages
 from .case import Case, digest_of_source
 
 NUMBERS = {"tidal_volume": "ml", "pip": "cmH2O", "peep": "cmH2O", "inspiration": "s", "expiration": "s", "breaths": ""}
-FOR_MASKS = ("volume", "size", "cells", "labels")  # options that go to tools/lung_mesh
 CELLS_FOR_A_RANK = 4000  # fewer cells are not worth a second process
 
 
@@ -67,12 +66,20 @@ def parse(words):
     return given
 
 
-def scene_file(name):
-    """The option file that --mode names."""
-    for path in (SCENES / f"{name}.opts", Path(name)):
+def option_file(option, name, folder):
+    """The option file that an option of the call names: one of a folder of petsc_options by its short name, or a path."""
+    for path in (folder / f"{name}.opts", Path(name)):
         if path.is_file():
             return path
-    fail(f"--mode {name} is no option file, and no scene of petsc_options/scenes: {', '.join(sorted(p.stem for p in SCENES.glob('*.opts')))}")
+    fail(f"{option} {name} is no option file, and none of petsc_options/{folder.name}: {', '.join(sorted(p.stem for p in folder.glob('*.opts')))}")
+
+
+def scene_file(name):
+    return option_file("--mode", name, SCENES)
+
+
+def solver_file(name):
+    return option_file("--solver", name, SOLVERS)
 
 
 def scene_words(given):
@@ -99,13 +106,6 @@ def own_words(given):
         if getattr(given, option):
             words += [f"-{option}", getattr(given, option)]
     return words + given.flags
-
-
-def solver_file(name):
-    for path in (SOLVERS / f"{name}.opts", Path(name)):
-        if path.is_file():
-            return path
-    fail(f"--solver {name} is no option file, and none of petsc_options/solvers: {', '.join(sorted(p.stem for p in SOLVERS.glob('*.opts')))}")
 
 
 def stem(path):
@@ -135,7 +135,7 @@ def begin(words):
     if not is_mesh and not given.source.is_dir() and not given.source.name.endswith((".nii", ".nii.gz")):
         fail(f"{given.source} is no label image (.nii, .nii.gz) and no mesh (.msh); tools/lung_mesh --convert makes one of other formats")
     if is_mesh:
-        for option in FOR_MASKS:
+        for option in stages.FOR_MASKS:
             if getattr(given, option):
                 fail(f"--{option} makes a mesh of a mask, and {given.source} is a mesh already: leave it out")
     listed(given.build / "pulmo")  # before any folder is made

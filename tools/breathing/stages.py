@@ -14,6 +14,7 @@ from shared.common import SOURCE, environment, fail
 from .progress import Progress
 
 BUDGET = "30min"
+FOR_MASKS = ("volume", "size", "cells", "labels")  # options that go to tools/lung_mesh
 PULMO_STOPPED = 3  # exit code: there is a checkpoint to go on from
 
 
@@ -21,20 +22,20 @@ def say(text):
     print(f"breathe: {text}", flush=True)
 
 
+def surroundings():
+    """The environment without options of PETSc's: what counts is in the case."""
+    return {name: value for name, value in environment().items() if not name.startswith("PETSC_OPTIONS")}
+
+
 def told(command, log, what, **place):
     """Runs a command, its words shown and kept; ends the program if it fails."""
     with open(log, "w") as out:
-        process = subprocess.Popen([str(word) for word in command], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment(), **place)
+        process = subprocess.Popen([str(word) for word in command], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=surroundings(), **place)
         for line in process.stdout:
             out.write(line)
             print("  " + line, end="", flush=True)
     if process.wait():
         fail(f"{what} failed, see above")
-
-
-def surroundings():
-    """The environment without options of PETSc's: what counts is in the case."""
-    return {name: value for name, value in environment().items() if not name.startswith("PETSC_OPTIONS")}
 
 
 def mesh(case, given):
@@ -55,7 +56,7 @@ def mesh(case, given):
         shutil.copyfile(given.source, to)
     else:
         say(f"making a mesh of {given.source}")
-        more = [word for option in ("volume", "size", "cells", "labels") if getattr(given, option)
+        more = [word for option in FOR_MASKS if getattr(given, option)
                 for word in (f"--{option}", getattr(given, option))]
         told([tool, "--mask", given.source.resolve(), "--output", to, *page, *more], log, "tools/lung_mesh")
     case.save(mesh={"file": to.name, "seconds": round(time.monotonic() - begun, 1), "source": str(given.source)})
@@ -63,8 +64,8 @@ def mesh(case, given):
 
 def cells_of(case):
     """Number of tetrahedra, as tools/lung_mesh told it."""
-    found = re.search(r"(\d+) tetrahedra|tetrahedra\s+(\d+)", (case.folder / "mesh.txt").read_text())
-    return int(found[1] or found[2]) if found else 0
+    found = re.search(r"^tetrahedra +(\d+)$", (case.folder / "mesh.txt").read_text(), re.MULTILINE)
+    return int(found[1]) if found else 0
 
 
 def ranks_for(case, cells_for_a_rank):
