@@ -185,6 +185,19 @@ class Mask(unittest.TestCase):
         self.assertTrue((case / "mesh.html").exists() and (case / "report.html").exists())
 
 
+class Within(unittest.TestCase):
+    def test_the_run_takes_what_the_search_found(self):
+        """The setting named by tools/accuracy_cost, though a step of the call's own scene is smaller."""
+        place = folder()
+        made = called(os.path.join(pulmo.SOURCE, "meshes/cube_lung.msh"), "--case", "c", *QUICK, "--within", "C_rs=20%", "--budget", "5min", "--",
+                      "-mesh_scale", "10", cwd=place)
+        self.assertEqual(made.returncode, 0, made.stdout + made.stderr)
+        found = re.search(r"backward Euler ([\d.]+) s", re.search(r"\*\*C_rs within 20 %\*\*: (.*)", made.stdout)[1])
+        self.assertGreater(float(found[1]), 0.05)
+        summary = json.loads((place / "c/run/summary.json").read_text())
+        self.assertEqual(float(summary["options"]["-ts_dt"]), float(found[1]))
+
+
 class Mistakes(unittest.TestCase):
     """One sentence that names it, exit code 1, nothing of the user's touched."""
 
