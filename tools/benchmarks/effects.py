@@ -23,7 +23,7 @@ SCENE = ("-tissue patte -tissue_porosity 0.75 -elements P1-P1 -chest_wall_direct
 ON = {"airway_tree": "-airway_tree star -airway_tree_resistance 3",
       "breathing_effort": "-breathing_effort -breathing_effort_pressure 5 -breathing_effort_rise 0.6 -breathing_effort_hold 0.1 "
                           "-breathing_effort_fall 0.3 -breathing_effort_period 2",
-      "cavity": "-cavity -cavity_gap 2 -snes_linesearch_type l2",
+      "cavity": "-cavity -cavity_gap 8 -snes_linesearch_type l2",
       "gravity": "-gravity",
       "inertia": "-inertia",
       "prestress": "-prestress",
