@@ -358,6 +358,32 @@ PetscErrorCode AirwayNodes::mean_pressure(Vec local, PetscReal &mean) const
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode AirwayNodes::add_mean_gradient(PetscReal factor, Vec local) const
+{
+  PetscFunctionBeginUser;
+  WriteArray x(local);
+  for (const Node &node : nodes_) x[node.dof] += factor * node.area / area_;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode AirwayNodes::fill(Vec local, PetscReal value) const
+{
+  PetscFunctionBeginUser;
+  WriteArray x(local);
+  for (const Node &node : nodes_) x[node.dof] = value;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode AirwayNodes::sum(Vec local, PetscReal &sum) const
+{
+  PetscFunctionBeginUser;
+  const ReadArray x(local);
+  sum = 0;
+  for (const Node &node : nodes_) sum += x[node.dof];
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &sum, 1, MPIU_REAL, MPI_SUM, comm_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 std::vector<std::size_t> AirwayNodes::acting() const
 {
   std::vector<std::size_t> list;

@@ -133,6 +133,7 @@ PetscErrorCode Assembly::setup_cells()
   points.insert(points.end(), {-1, -1, -1, 1, -1, -1, -1, 1, -1, -1, -1, 1});
   watched_points_ = Nq + 4;
   PetscCall(watched_.setup(fe, points));
+  watched_at_ = std::move(points);
   rule_weights_.assign(weights, weights + Nq);
   const PetscReal total = std::accumulate(weights, weights + Nq, PetscReal(0));
   for (PetscReal w : rule_weights_) relative_weights_.push_back(w / total);
@@ -349,13 +350,11 @@ PetscErrorCode Assembly::residual(Part part, PetscReal t, Vec x, Vec x_t, const 
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Assembly::jacobian(Part part, PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[],
-                                  Mat A, CellMatrices *also)
+template <class Scatter>
+PetscErrorCode Assembly::for_matrices(Part part, PetscReal t, Vec x, Vec x_t, PetscReal shift,
+                                      const PetscReal row_scale[], CellMatrices *also, Scatter &&scatter)
 {
   PetscFunctionBeginUser;
-  PetscCall(map_.setup(dm_, layout_, A));
-  if (part == Part::all) PetscCall(MatZeroEntries(A));
-  PetscCall(map_.begin());
   const auto on_cells = [&](PetscInt n, PetscFEGeom *geom, const PetscScalar *u, const PetscScalar *u_t,
                             PetscScalar *matrices) -> PetscErrorCode {
     PetscFunctionBeginUser;
@@ -378,9 +377,60 @@ PetscErrorCode Assembly::jacobian(Part part, PetscReal t, Vec x, Vec x_t, PetscR
     }
     PetscFunctionReturn(PETSC_SUCCESS);
   };
-  const auto scatter = [&](PetscInt cell, const PetscScalar *matrix) { return map_.add(cell, matrix, row_scale, A); };
   PetscCall(for_blocks(part, x, x_t, layout_.size * layout_.size, on_cells, on_facets, scatter));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Assembly::jacobian(Part part, PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[],
+                                  Mat A, CellMatrices *also)
+{
+  PetscFunctionBeginUser;
+  PetscCall(map_.setup(dm_, layout_, A));
+  if (part == Part::all) PetscCall(MatZeroEntries(A));
+  PetscCall(map_.begin());
+  const auto scatter = [&](PetscInt cell, const PetscScalar *matrix) { return map_.add(cell, matrix, row_scale, A); };
+  PetscCall(for_matrices(part, t, x, x_t, shift, row_scale, also, scatter));
   PetscCall(map_.end(A));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Assembly::transposed_jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[],
+                                             Mat A, CellMatrices *also)
+{
+  const PetscInt size = layout_.size;
+  const std::vector<PetscReal> unscaled(static_cast<std::size_t>(n_fields_), 1);
+  std::vector<PetscScalar> transposed(static_cast<std::size_t>(size * size));
+
+  PetscFunctionBeginUser;
+  PetscCall(map_.setup(dm_, layout_, A));
+  PetscCall(MatZeroEntries(A));
+  PetscCall(map_.begin());
+  const auto scatter = [&](PetscInt cell, const PetscScalar *matrix) {
+    for (PetscInt i = 0; i < size; ++i)
+      for (PetscInt j = 0; j < size; ++j)
+        transposed[j * size + i] = row_scale[layout_.field_of[i]] * matrix[i * size + j];
+    return map_.add(cell, transposed.data(), unscaled.data(), A);
+  };
+  PetscCall(for_matrices(Part::all, t, x, x_t, shift, row_scale, also, scatter));
+  PetscCall(map_.end(A));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Assembly::add_transposed_product(PetscReal t, Vec x, Vec x_t, PetscReal shift,
+                                                const PetscReal row_scale[], Vec z, Vec y)
+{
+  PetscFunctionBeginUser;
+  const ReadArray zs(z);
+  WriteArray ys(y);
+  const auto scatter = [&](PetscInt cell, const PetscScalar *matrix) -> PetscErrorCode {
+    const PetscInt *dofs = cell_dofs(cell);
+    for (PetscInt i = 0; i < layout_.size; ++i) {
+      const PetscScalar weight = row_scale[layout_.field_of[i]] * zs[dofs[i]];
+      for (PetscInt j = 0; j < layout_.size; ++j) ys[dofs[j]] += weight * matrix[i * layout_.size + j];
+    }
+    return PETSC_SUCCESS;
+  };
+  PetscCall(for_matrices(Part::all, t, x, x_t, shift, row_scale, nullptr, scatter));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

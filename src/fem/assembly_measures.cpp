@@ -142,4 +142,47 @@ PetscErrorCode Assembly::volume_derivative(Vec x, Vec y, PetscReal &derivative) 
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode Assembly::add_volume_gradient(Vec x, Vec weight, PetscReal factor, Vec y)
+{
+  const element::ScalarBasis basis = watched_.basis();
+
+  PetscFunctionBeginUser;
+  if (weight && weighing_.nodes() == 0) {
+    PetscFE fe;
+    PetscCall(PetscDSGetDiscretization(ds_, pressure, (PetscObject *)&fe));
+    PetscCall(weighing_.setup(fe, watched_at_));
+  }
+  const ReadArray xs(x), qs(weight ? weight : x);
+  WriteArray ys(y);
+  for (PetscInt c = 0; c < layout_.cells; ++c) {
+    const PetscInt *dofs = cell_dofs(c), *mass_dofs = dofs + 3 * basis.nodes;
+    const PetscReal *inverse = &invJ_[9 * c];
+    const CellDisplacement u(watched_, inverse, dofs, xs.data());
+    Vector4 sum[max_nodes] = {};
+    for (std::size_t q = 0; q < rule_weights_.size(); ++q) {
+      PetscScalar H[9], cof_F[9], value = weight ? 0 : 1;
+      if (weight) {
+        const element::ScalarBasis mass = weighing_.basis();
+        for (PetscInt a = 0; a < mass.nodes; ++a)
+          value += mass.values[static_cast<PetscInt>(q) * mass.stride + a] * qs[mass_dofs[a]];
+      }
+      u.gradient(static_cast<PetscInt>(q), H);
+      for (int i = 0; i < 3; ++i) H[4 * i] += 1;
+      cofactor(H, cof_F);
+      Vector4 along[3]; // cof F by the directions of the reference cell
+      for (int e = 0; e < 3; ++e) {
+        along[e] = Vector4{};
+        for (int d = 0; d < 3; ++d) along[e] += inverse[3 * e + d] * Vector4{cof_F[d], cof_F[3 + d], cof_F[6 + d], 0};
+        along[e] *= factor * value * rule_weights_[q] * detJ_[c];
+      }
+      const PetscScalar *D = basis.derivatives + static_cast<PetscInt>(q) * 3 * basis.stride;
+      for (PetscInt a = 0; a < basis.nodes; ++a)
+        sum[a] += D[a] * along[0] + D[basis.stride + a] * along[1] + D[2 * basis.stride + a] * along[2];
+    }
+    for (PetscInt a = 0; a < basis.nodes; ++a)
+      for (int i = 0; i < 3; ++i) ys[dofs[3 * a + i]] += sum[a][i];
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 } // namespace pulmo

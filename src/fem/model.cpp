@@ -363,6 +363,14 @@ PetscErrorCode Model::pack_constants()
 
   PetscFunctionBeginUser;
   constants_ = composition().constants(step_);
+  if (change_.by != 0) {
+    constants_[static_cast<std::size_t>(change_.constant)] += change_.by;
+    for (const DerivedParameter &derived : composition().derived()) {
+      const char *owner;
+      const PetscInt place = composition().constant_at(derived.target, &owner);
+      constants_[static_cast<std::size_t>(place)] = derived.value(constants_);
+    }
+  }
   const auto n = static_cast<PetscInt>(constants_.size());
   PetscCall(DMGetDS(dm_, &ds));
   PetscCall(PetscDSSetConstants(ds, n, constants_.data()));
@@ -496,6 +504,14 @@ PetscErrorCode Model::residual(PetscReal t, Vec x, Vec x_t, Vec F)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode Model::facet_residual(PetscReal t, Vec x, Vec x_t, Vec F)
+{
+  PetscFunctionBeginUser;
+  PetscCall(VecZeroEntries(F));
+  PetscCall(assembly_.residual(Assembly::Part::facets, t, x, x_t, row_scale_.data(), F));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 /// PETSc's own loop over cells, then the scaling of the rows.
 PetscErrorCode Model::stock_residual(PetscReal t, Vec x, Vec x_t, Vec F)
 {
@@ -535,6 +551,16 @@ PetscErrorCode Model::jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, Mat
     PetscCall(also_->end(airway_.closed_points()));
   }
   if (closes_rows_) PetscCall(airway_.close_rows(A, composition().n_scalars() > 0));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Model::transposed_jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, Mat A)
+{
+  PetscFunctionBeginUser;
+  PetscCheck(!stock_loops(), PetscObjectComm((PetscObject)(DM)dm_), PETSC_ERR_SUP, "needs pulmo's own integration");
+  if (also_) PetscCall(also_->begin());
+  PetscCall(assembly_.transposed_jacobian(t, x, x_t, shift, row_scale_.data(), A, also_));
+  if (also_) PetscCall(also_->end(airway_.closed_points()));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

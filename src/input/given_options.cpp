@@ -223,6 +223,14 @@ OptionList Options::own_used() const
   return list;
 }
 
+std::vector<Options::RealOption> Options::real_options() const
+{
+  std::vector<RealOption> list;
+  for (const Declared &d : declared_)
+    if (groups_[d.group].in_use && d.target) list.push_back({d.name, d.unit, d.target});
+  return list;
+}
+
 std::vector<Options::Setting> Options::settings(const std::string &group) const
 {
   const std::string prefix = "-" + group;

@@ -111,6 +111,7 @@ PetscErrorCode Options::real(const std::string &name, const std::string &unit, R
 
   PetscFunctionBeginUser;
   PetscCall(find(name, number_text(value), unit, range.text(), help, raw, is_given));
+  declared_.back().target = &value;
   if (is_given) {
     drop_varying(value);
     PetscCall(parse_varying(full(name), raw, unit, range, value));

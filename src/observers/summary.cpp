@@ -185,6 +185,27 @@ Json errors_json(const ErrorReport &report)
   return json;
 }
 
+/// Derivatives of numbers by parameters, and what the sweep took.
+Json sensitivities_json(const SensitivityReport &report)
+{
+  Json json = {{"numbers", Json::object()}};
+  for (std::size_t k = 0; k < report.numbers.size() && report.failure.empty(); ++k) {
+    Json parameters = Json::object();
+    for (const SensitivityReport::Parameter &p : report.parameters)
+      parameters[p.option] = {{"value", p.value},
+                              {"unit", p.unit},
+                              {"derivative", p.derivative[k]},
+                              {"percent_for_one_percent_more", report.percent(p, k)}};
+    json["numbers"][report.numbers[k].key] = {{"value", report.numbers[k].value}, {"parameters", parameters}};
+  }
+  json["not_defined"] = report.undefined;
+  json["failure"] = report.failure.empty() ? Json(nullptr) : Json(report.failure);
+  json["seconds"] = report.seconds;
+  json["linear_solves"] = report.solves;
+  json["krylov_iterations"] = report.krylov;
+  return json;
+}
+
 /// What each effect adds and takes, on rank 0.
 Json ledger_json(const Scene &scene, const Model &model, const StageSeconds &seconds)
 {
@@ -281,6 +302,7 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
         json["breaths"].push_back(breath);
       }
     }
+    if (audits.sensitivities) json["sensitivities"] = sensitivities_json(*audits.sensitivities);
     if (audits.errors) json["error_estimate"] = errors_json(*audits.errors);
     if (audits.energy) json["energy_j"] = energy_json(*audits.energy, audits.energy->rows().back());
     const bool gas = scene.facts().airflow || scene.facts().ventilator;

@@ -187,4 +187,28 @@ PetscErrorCode print_error_bars(MPI_Comm comm, const ErrorReport &report)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode print_sensitivities(MPI_Comm comm, const SensitivityReport &report, double run_seconds)
+{
+  PetscFunctionBeginUser;
+  for (const std::string &name : report.undefined)
+    PetscCall(PetscPrintf(comm, "pulmo: note: -sensitivities: this run has no %s\n", name.c_str()));
+  if (!report.failure.empty()) {
+    PetscCall(PetscPrintf(comm,
+                          "pulmo: warning: no sensitivities: %s; solvers/direct.opts solves whatever the run solved\n",
+                          report.failure.c_str()));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+  if (report.numbers.empty()) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(PetscPrintf(comm, "\n%-36s %12s", "1 % more of it changes, by %", ""));
+  for (const SensitivityReport::Number &n : report.numbers) PetscCall(PetscPrintf(comm, " %8s", n.name.c_str()));
+  for (const SensitivityReport::Parameter &p : report.parameters) {
+    PetscCall(PetscPrintf(comm, "\n  %-34s %12.5g", p.option.c_str(), p.value));
+    for (std::size_t k = 0; k < report.numbers.size(); ++k)
+      PetscCall(PetscPrintf(comm, " %8.3f", report.percent(p, k)));
+  }
+  PetscCall(PetscPrintf(comm, "\nThe sweep took %.3g s beside the %.3g s of the run (%+.0f %%).\n", report.seconds,
+                        run_seconds, 100 * report.seconds / run_seconds));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 } // namespace pulmo

@@ -124,6 +124,13 @@ std::vector<std::string> Composition::surfaces_that_read(const char *owner) cons
   return list;
 }
 
+bool Composition::read_on_surfaces_alone(const char *owner) const
+{
+  return std::none_of(readers_.begin(), readers_.end(), [owner](const Reader &reader) {
+    return reader.surface.empty() && constants::tag(reader.owner) == constants::tag(owner);
+  });
+}
+
 std::vector<PetscScalar> Composition::constants(const Step &step) const
 {
   const PetscInt blocks = constant_blocks();

@@ -1,6 +1,7 @@
 // The program as a library: initialisation, a scene made ready (Run), a whole run with its files (run()).
 #include "pulmo/pulmo.hpp"
 
+#include "pulmo/adjoint/sensitivities.hpp"
 #include "pulmo/base/units.hpp"
 #include "pulmo/fem/held.hpp"
 #include "pulmo/input/errors.hpp"
@@ -235,6 +236,7 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   Output output;
   ErrorEstimate error_estimate(registry);
   DryRun dry_run(registry);
+  Sensitivities sensitivities;
   Checkpoint checkpoint(options, output, scene, run.model(), simulation);
   SceneWords words;
   bool view_effects = false, view_scene = false, only_scene = false, audit_energy = true, asked_to_stop = false;
@@ -248,6 +250,7 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   PetscCall(checkpoint.declare(options));
   PetscCall(error_estimate.declare(options));
   PetscCall(dry_run.declare(options));
+  PetscCall(sensitivities.declare(options));
   options.group("scene", "the scene in words");
   PetscCall(options.flag("view", "print before the run what is in the scene, what is not, and how far its tissue goes",
                          view_scene));
@@ -272,6 +275,7 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   PetscCall(look_ahead(comm, scene, run.model(), simulation, run.settle_note()));
   PetscCall(error_estimate.check(options, scene));
   PetscCall(dry_run.check(options, checkpoint.restart()));
+  PetscCall(sensitivities.check(options, scene, run.model(), !checkpoint.restart().empty()));
   if (only_scene) {
     finished = true;
     PetscFunctionReturn(PETSC_SUCCESS);
@@ -329,6 +333,7 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   PetscCall(output.prepare(options, checkpoint.restart(), fields.files()));
   PetscCall(write_scene(options, words, output.path("scene.json")));
   if (restarts) PetscCall(fields.carry_over(checkpoint.restart_directory()));
+  PetscCall(sensitivities.attach(simulation, output.directory()));
   {
     StopSignal signal(comm);
     simulation.heed(signal);
@@ -354,6 +359,13 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   PetscCall(write_summary(options, output, scene, run.model(), simulation, audits, true));
   PetscCall(print_numbers(comm, output, scene, simulation, audits));
   const std::vector<SignalRow> rows = regions.complete(simulation.rows());
+  SensitivityReport sensitivity_report;
+  if (sensitivities.in_use() && !asked_to_stop) {
+    PetscCall(sensitivities.make(options, scene, run.model(), simulation, rows, sensitivity_report));
+    audits.sensitivities = &sensitivity_report;
+    PetscCall(write_summary(options, output, scene, run.model(), simulation, audits, true));
+    PetscCall(print_sensitivities(comm, sensitivity_report, simulation.seconds().total));
+  }
   if (error_estimate.in_use() && (asked_to_stop || complete_breaths(rows).empty())) {
     PetscCall(PetscPrintf(comm, "pulmo: warning: no error estimate: %s\n",
                           asked_to_stop ? "the run was asked to stop" : why_no_numbers(scene, rows).c_str()));

@@ -18,6 +18,7 @@ constexpr PetscReal volume_tolerance = 1e-10;
 void Airway::begin_phase(const Phase &phase, PetscReal volume, PetscReal first_step)
 {
   phase_ = phase;
+  starts_from_before_ = !phase_.from;
   if (!phase_.from) phase_.from = ventilator_before_;
   volume_begin_ = volume + scalars_.stored(before_);
   first_step_ = first_step;
@@ -74,6 +75,29 @@ PetscReal Airway::prescribed_pressure(PetscReal t, PetscReal step_end) const
   return phase_.value(t);
 }
 
+PetscReal Airway::share_of_start(PetscReal t, PetscReal step_end) const
+{
+  const PetscReal since = std::max<PetscReal>(t - phase_.begin, 0), until = step_end - phase_.begin;
+  if (limited_) return 0;
+  if (phase_.ramp == 0) return until < first_step_ ? 1 - until / first_step_ : 0;
+  return since < phase_.ramp ? 1 - since / phase_.ramp : 0;
+}
+
+Airway::Condition Airway::condition() const
+{
+  const bool flows = control() == Control::flow;
+  Condition c;
+  c.mode = mode_;
+  c.control = control();
+  c.target = flows ? volume_target_ : target_;
+  c.share = flows ? 0 : share_of_start_;
+  c.by_start = flows ? 1 : starts_from_before_ ? share_of_start_ : 0;
+  c.limited = limited_;
+  c.pressure = pressure_;
+  c.flow = mode_ == Mode::free ? flow() : 0;
+  return c;
+}
+
 void Airway::begin(PetscReal t, PetscReal step_end)
 {
   limited_ = limited_before_ || retake_;
@@ -84,6 +108,7 @@ void Airway::begin(PetscReal t, PetscReal step_end)
     volume_target_ = volume_begin_ + phase_.delivered(t);
   else
     target_ = prescribed_pressure(t, step_end);
+  share_of_start_ = share_of_start(t, step_end);
   std::vector<PetscReal> values = before_; // not what a failed attempt left
   if (mode_ == Mode::held) values.front() = target_;
   pressure_ = values.front();

@@ -150,6 +150,7 @@ PetscErrorCode Simulation::start()
   airway_.start();
   accepted_.scalars.assign(model_.composition().n_scalars(), 0);
   accepted_.scalar_flows = accepted_.scalars;
+  PetscCall(record_stage(0, 0, before_));
   PetscCall(scheme_.begin(model_, moment(0, measures.volume_change, before_)));
   PetscCall(warn_of_low_limits());
   dt_ = asked_dt();
@@ -178,6 +179,7 @@ PetscErrorCode Simulation::run(bool &finished)
       if (asked_dt() != asked_before) dt_ = asked_dt();
       PetscCall(warn_of_low_limit(phase, accepted_.machine_pressure()));
       airway_.begin_phase(phase, accepted_.volume * units::mm3_per_ml, std::min(asked_dt(), phase.end - phase.begin));
+      if (trajectory_) trajectory_->begin_phase();
       begin_smooth_stretch();
       next_dt_ = landing(phase.begin);
     }

@@ -175,6 +175,7 @@ PetscErrorCode Simulation::accept_stage(PetscReal t, Vec X, PetscBool *accept)
     PetscCall(model_.memory()->compute(t, local_, rate_));
     model_.memory()->keep_middle();
   }
+  if (scheme_.half_step()) PetscCall(record_stage(t, -1, local_));
   PetscCall(scheme_.accept_stage(model_, moment(t, measures.volume_change, local_)));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -371,6 +372,7 @@ PetscErrorCode Simulation::after_step()
   if (scene_.facts().airflow) PetscCall(consistent_flow(flow));
   row.flow = flow / units::mm3_per_ml;
   PetscCall(VecCopy(local_, before_));
+  PetscCall(record_stage(t, static_cast<PetscInt>(rows_.size()), local_));
   const PetscReal opening_flow = airway_.opening_flow(row.flow * units::mm3_per_ml);
   const Attempt accepted{t, row.dt, measures.volume_change, pressure, opening_flow, local_};
   for (Partner *partner : partners_) partner->accept(accepted);
@@ -412,6 +414,21 @@ PetscErrorCode Simulation::after_step()
   if (crawled_ == crawling_steps) PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
   if (ends_early) PetscCall(TSSetConvergedReason(ts_, TS_CONVERGED_USER));
   if (!same(t, end_)) PetscCall(heed_request(TS_CONVERGED_USER));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Simulation::record_stage(PetscReal t, PetscInt row, Vec local)
+{
+  PetscFunctionBeginUser;
+  if (!trajectory_) PetscFunctionReturn(PETSC_SUCCESS);
+  StageRecord record;
+  record.time = t;
+  record.stage = scheme_.stage();
+  record.load = model_.load();
+  record.row = row;
+  record.phase = phase_ ? static_cast<PetscInt>(phase_ - phases_.data()) : 0;
+  record.airway = airway_.condition();
+  PetscCall(trajectory_->keep(record, scheme_, local));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -6,7 +6,7 @@ import unittest
 import pulmo_case as case
 
 # A folder includes itself and those before it.
-FOLDERS = ["base", "input", "mesh", "physics", "fem", "solvers", "time", "observers", "program"]
+FOLDERS = ["base", "input", "mesh", "physics", "fem", "solvers", "time", "observers", "adjoint", "program"]
 # What a kernel is made of knows no mesh, no options file and no solver.
 KERNELS = ["kinematics", "point", "tissue_law", "permeability"]
 # A tool reads its command line and calls the modules of a folder beside it.

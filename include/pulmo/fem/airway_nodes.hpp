@@ -68,6 +68,12 @@ public:
 
   /// Mean pressure over all groups (eq. 48), kPa, from a local vector. Collective.
   PetscErrorCode mean_pressure(Vec local, PetscReal &mean) const;
+  /// Adds @p factor times the derivative of that mean to a local vector.
+  PetscErrorCode add_mean_gradient(PetscReal factor, Vec local) const;
+  /// Writes @p value at all nodes of a local vector.
+  PetscErrorCode fill(Vec local, PetscReal value) const;
+  /// Sum of a local vector over the nodes. Collective.
+  PetscErrorCode sum(Vec local, PetscReal &sum) const;
   /// Flow into the lung by the pressure of each scalar, mm^3/s: the consistent flux, from a local residual whose mass
   /// rows were scaled by @p scale. Where p is held the mass residual is - int Q.N q; summed over the nodes where the
   /// lung is open it is exactly the rate of int (J - 1). Collective.

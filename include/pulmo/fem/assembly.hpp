@@ -72,12 +72,22 @@ public:
   /// With @p also the element matrices of the cells go there too. Collective.
   PetscErrorCode jacobian(Part part, PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[], Mat A,
                           CellMatrices *also = nullptr);
+  /// The same transposed, for Part::all; columns of A are what is scaled then.
+  PetscErrorCode transposed_jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[], Mat A,
+                                     CellMatrices *also = nullptr);
+  /// Adds that transposed Jacobian times @p z to @p y, element by element and without a matrix. All are local vectors;
+  /// what is held has rows and columns, too.
+  PetscErrorCode add_transposed_product(PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[],
+                                        Vec z, Vec y);
   /// From now on the air is measured: @p airless_J is 1 - Phi0 of each cell.
   void need_air(std::vector<PetscReal> airless_J) { airless_J_ = std::move(airless_J), needs_air_ = true; }
   /// J and its integral for the local vector @p x. Collective.
   PetscErrorCode measure(Vec x, Measures &measures) const;
   /// int cof F(x) : Grad y, the derivative of int (J - 1) in direction @p y, mm^3. Collective.
   PetscErrorCode volume_derivative(Vec x, Vec y, PetscReal &derivative) const;
+  /// Adds @p factor times the derivative of int (J - 1) q by the displacements to @p y; q is the pressure field of @p
+  /// weight, or 1 if that is null. Local vectors.
+  PetscErrorCode add_volume_gradient(Vec x, Vec weight, PetscReal factor, Vec y);
 
   /// Kinematic states at the quadrature points, then the corners, of cell @p c (counted from 0).
   void point_states(PetscInt c, const PetscScalar *x, std::vector<PointState> &states) const;
@@ -98,6 +108,10 @@ private:
   template <class OnCells, class OnFacets, class Scatter>
   PetscErrorCode for_blocks(Part part, Vec x, Vec x_t, PetscInt result_size, OnCells &&on_cells, OnFacets &&on_facets,
                             Scatter &&scatter);
+  /// The same for the matrices of dF/dx + shift dF/dx_t.
+  template <class Scatter>
+  PetscErrorCode for_matrices(Part part, PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[],
+                              CellMatrices *also, Scatter &&scatter);
   PetscInt places_per_call() const;
   PetscErrorCode put_places(const std::vector<PetscReal> &rows, const std::string &surface, PetscInt begin);
   PetscFEGeom block_geometry(PetscInt begin, PetscInt n);
@@ -107,8 +121,10 @@ private:
   PetscInt n_fields_ = 0, first_cell_ = 0;
   CellLayout layout_;
   std::vector<PetscReal> v0_, J_, invJ_, detJ_;
-  element::BasisTable watched_; ///< of displacement where J is watched: the quadrature points, then the corners
+  element::BasisTable watched_;  ///< of displacement where J is watched: the quadrature points, then the corners
+  element::BasisTable weighing_; ///< of pressure at the same points, once add_volume_gradient() weighs by it
   PetscInt watched_points_ = 0;
+  std::vector<PetscReal> watched_at_; ///< these points in the reference cell
   std::vector<PetscReal> rule_weights_, relative_weights_;
   bool needs_air_ = false;
   std::vector<PetscReal> airless_J_; ///< of each cell

@@ -49,6 +49,8 @@ public:
   /// Local residual, rows scaled. @p x and @p x_t are local vectors with constrained values in place. Rows of held
   /// nodes hold the flux that enters there.
   PetscErrorCode residual(PetscReal t, Vec x, Vec x_t, Vec F);
+  /// The share of the facets in it.
+  PetscErrorCode facet_residual(PetscReal t, Vec x, Vec x_t, Vec F);
   /// Sums of a global residual over the nodes, by field and in its units: kPa mm^2; mm^3/s.
   struct ResidualSums {
     std::vector<PetscReal> absolute, net;
@@ -63,6 +65,15 @@ public:
   /// Global Jacobian dF/dx + shift dF/dx_t, rows scaled.
   PetscErrorCode jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, Mat A);
 
+  /// The transpose of that Jacobian with the rows and columns of the airway's nodes as they are:
+  /// AirwayNodes::close_rows() closes them. Needs pulmo's own integration.
+  PetscErrorCode transposed_jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, Mat A);
+  /// Adds that transpose times @p z to @p y, without a matrix; local vectors, what is held included.
+  PetscErrorCode add_transposed_product(PetscReal t, Vec x, Vec x_t, PetscReal shift, Vec z, Vec y)
+  {
+    return assembly_.add_transposed_product(t, x, x_t, shift, row_scale_.data(), z, y);
+  }
+
   /// Lets each Jacobian hand its element matrices to @p matrices, too, which must outlive the model.
   void also_fill(CellMatrices &matrices) { also_ = &matrices; }
 
@@ -71,6 +82,11 @@ public:
   PetscErrorCode volume_derivative(Vec x, Vec y, PetscReal &derivative) const
   {
     return assembly_.volume_derivative(x, y, derivative);
+  }
+  /// Adds @p factor times the derivative of int (J - 1) q by the displacements to @p y (Assembly::add_volume_gradient).
+  PetscErrorCode add_volume_gradient(Vec x, Vec weight, PetscReal factor, Vec y)
+  {
+    return assembly_.add_volume_gradient(x, weight, factor, y);
   }
   /// Force that each of the composition's constraints bears (a pin, a held surface), from a local residual, kPa mm^2:
   /// the sum of its displacement rows.
@@ -82,6 +98,10 @@ public:
 
   /// What effects remember at the points; null if none does.
   PointMemory *memory() const { return memory_.get(); }
+
+  /// Adds @p change to what a kernel is told at place @p constant of its constants (Composition::constant_at) from the
+  /// next set_step() on, and to what follows from that; 0 ends it. Parameters that differ from place to place: none.
+  void change_parameter(PetscInt constant, PetscReal change) { change_ = {constant, change}; }
 
   PetscReal row_scale(PetscInt field) const { return row_scale_[field]; }
   PetscReal modulus() const { return modulus_; } ///< tissue stiffness that scales the equations, kPa
@@ -129,6 +149,10 @@ private:
   bool closes_rows_ = false;         ///< the airway has rows that say nothing of a field while it is held
   std::vector<ISHandle> field_rows_; ///< global rows of each field that this rank owns
   Step step_;
+  struct {
+    PetscInt constant = -1;
+    PetscReal by = 0;
+  } change_; ///< of a parameter
   PetscReal modulus_ = 1;
   std::vector<PetscReal> row_scale_;
   PetscInt quadrature_degree_ = 3;

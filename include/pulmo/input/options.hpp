@@ -133,6 +133,12 @@ public:
   PetscErrorCode all_used(OptionList &list) const;
   /// The first half of it: pulmo's own.
   OptionList own_used() const;
+  /// A number that an option of pulmo's own gave, or left at its default, in a group that is in use.
+  struct RealOption {
+    std::string option, unit;
+    PetscReal *target = nullptr;
+  };
+  std::vector<RealOption> real_options() const;
   /// What the run uses of the options of an effect.
   struct Setting {
     std::string name, value, unit; ///< name: without the effect's, blanks for _; unit: empty if it has none
@@ -152,8 +158,9 @@ private:
     std::string name, value, unit, range, help; ///< value: the default
     std::string used;                           ///< as given, or the default
     std::size_t group;
-    bool tolerated = false; ///< may be given where its group is not in use
-    bool settled = false;   ///< left open, and decided by the scene
+    PetscReal *target = nullptr; ///< of one number
+    bool tolerated = false;      ///< may be given where its group is not in use
+    bool settled = false;        ///< left open, and decided by the scene
   };
   struct Group {
     std::string name, about, enabled_by;

@@ -7,6 +7,7 @@
 #include "pulmo/observers/error_bars.hpp"
 #include "pulmo/observers/gravity_audit.hpp"
 #include "pulmo/observers/regions.hpp"
+#include "pulmo/observers/sensitivity_report.hpp"
 #include "pulmo/time/simulation.hpp"
 
 #include <cstdio>
@@ -164,6 +165,7 @@ struct Audits {
   const EnergyAudit *energy;             ///< null with -energy_audit off
   const GravityAudit *gravity = nullptr; ///< null without gravity
   const ErrorReport *errors = nullptr;   ///< null before the estimate, or without -error_estimate
+  const SensitivityReport *sensitivities = nullptr; ///< null before the sweep, or without -sensitivities
 };
 
 /// Why a run with a ventilator has no clinical numbers, if it has none.
@@ -184,5 +186,8 @@ PetscErrorCode print_numbers(MPI_Comm comm, const Output &output, const Scene &s
 
 /// Prints each clinical number with its error bar, and what the bars cost.
 PetscErrorCode print_error_bars(MPI_Comm comm, const ErrorReport &report);
+
+/// Prints by how many percent each number changes where a parameter grows by one.
+PetscErrorCode print_sensitivities(MPI_Comm comm, const SensitivityReport &report, double run_seconds);
 
 } // namespace pulmo

@@ -411,6 +411,8 @@ public:
   PetscInt constant_at(const PetscReal *parameter, const char **owner) const;
   /// The surfaces on which terms read the parameters of @p owner.
   std::vector<std::string> surfaces_that_read(const char *owner) const;
+  /// Whether no term of the volume reads them.
+  bool read_on_surfaces_alone(const char *owner) const;
   /// Refuses terms that read parameters which no effect hands over, or two hand over, and memories that cannot be told
   /// apart: errors in an effect's code.
   PetscErrorCode check_parameters(MPI_Comm comm) const;
@@ -586,7 +588,9 @@ struct SceneFacts {
   PetscScalar (*pleural_suction)(PetscReal t, const PetscScalar constants[]) = nullptr; ///< by muscles, kPa; or none
   std::vector<std::string> airway_surfaces;    ///< open to the ventilator; without airflow those that would be
   std::shared_ptr<const Programme> ventilator; ///< null without a ventilator
-  std::vector<LoadTime> load_times;            ///< of loads other than the ventilator's
+  /// Its phases laid out again by its settings as they are now; @p settles: with a phase `settle` first.
+  std::function<Programme(bool settles)> programme_again;
+  std::vector<LoadTime> load_times; ///< of loads other than the ventilator's
   Settling settling;
   FlowSplit flow_split = FlowSplit::automatic;
   std::optional<AirwayResistance> tube; ///< between ventilator and airway

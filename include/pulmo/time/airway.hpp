@@ -89,6 +89,18 @@ public:
   bool holds_volume() const { return control() == Control::flow && phase_.to == 0 && phase_.ramp == 0; }
 
   Mode mode() const { return mode_; }
+  /// What the stage at hand asks of the airway, for whoever makes its equations again.
+  struct Condition {
+    Mode mode = Mode::held;
+    Control control = Control::pressure;
+    PetscReal target = 0;   ///< what is prescribed: pressure at the ventilator, kPa, or volume of the gas, mm^3
+    PetscReal by_start = 0; ///< its derivative by the pressure (kPa) or volume (mm^3) with which the phase began
+    PetscReal share = 0;    ///< that the pressure at the start of the phase has in a target of pressure
+    bool limited = false;   ///< the target is the limit of the phase
+    PetscReal pressure = 0; ///< at the opening, kPa
+    PetscReal flow = 0;     ///< prescribed on a free airway, mm^3/s
+  };
+  Condition condition() const;
   /// What of volume and pressure the step at hand leaves free.
   StepControl::Free free_values() const { return {control() != Control::flow, mode_ != Mode::held}; }
   /// Flow prescribed in the step at hand, mm^3/s.
@@ -100,6 +112,8 @@ private:
   void set_mode();
   /// The pressure that the phase prescribes, kPa.
   PetscReal prescribed_pressure(PetscReal t, PetscReal step_end) const;
+  /// The share that the pressure at the start of the phase has in it.
+  PetscReal share_of_start(PetscReal t, PetscReal step_end) const;
   /// Rate of the gas beyond the opening at volume @p gas of it (mm^3 above rest), mm^3/s.
   PetscReal gas_flow(PetscReal gas) const { return scheme_.slope() * gas + past_flow_; }
 
@@ -110,6 +124,8 @@ private:
   std::vector<PetscReal> before_ = {0}; ///< scalars before the step, kPa
   Phase phase_;
   Mode mode_ = Mode::held;
+  bool starts_from_before_ = false;                   ///< a ramp begins at what the ventilator has then
+  PetscReal share_of_start_ = 0;                      ///< in target_
   bool limited_ = false, limited_before_ = false;     ///< the limit is held now, was held in the step before
   bool exceeds_ = false;                              ///< the attempt judged last exceeds it
   bool retake_ = false;                               ///< the next attempt is the first one with the limit held

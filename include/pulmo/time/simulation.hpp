@@ -14,6 +14,7 @@
 #include "pulmo/time/observer.hpp"
 #include "pulmo/time/predictor.hpp"
 #include "pulmo/time/step_control.hpp"
+#include "pulmo/time/trajectory.hpp"
 
 #include <set>
 
@@ -37,6 +38,8 @@ public:
   /// Counts what was done before the run as set-up, s.
   void setup_took(double seconds) { seconds_.setup = seconds; }
   void add(Observer &observer) { observers_.push_back(&observer); }
+  /// Lets @p trajectory keep the accepted stages from the start on. It must outlive the run.
+  void record(Trajectory &trajectory) { trajectory_ = &trajectory; }
   /// Lets @p request end the run after the step at hand. It must outlive the run.
   void heed(StopRequest &request) { stop_request_ = &request; }
   /// Writes or reads the run after its last accepted step, observers included; after reading, run() goes on from there.
@@ -62,6 +65,7 @@ public:
   const StepControl &step_control() const { return step_control_; }
   PetscReal wanted_dt() const { return wanted_dt_; } ///< -ts_dt, s
   TS ts() const { return ts_; }
+  Mat matrix() const { return matrix_; } ///< of the Jacobians
   /// Whether the step after the last accepted one would be another one if the run did not end at -ts_max_time.
   bool end_cuts_next() const;
   /// Makes failure_text() say that @p what, as the solver leaves @p left, and which options made it so.
@@ -123,6 +127,8 @@ private:
   PetscErrorCode ask_partners(const Attempt &attempt, PetscBool *accept);
   PetscErrorCode past_of_partners(Archive &archive);
   void list_scalars(SignalRow &row) const;
+  /// Hands the accepted stage that ends at @p t with @p local to the trajectory. @p row: of the signals, or -1.
+  PetscErrorCode record_stage(PetscReal t, PetscInt row, Vec local);
   PetscErrorCode judge(PetscReal t, PetscReal volume, PetscReal pressure, bool &solved);
   PetscErrorCode consistent_flow(PetscReal &flow) const;
   PetscErrorCode keep_step(PetscReal dt);
@@ -165,6 +171,7 @@ private:
   FixedStress fixed_stress_;
   std::vector<Observer *> observers_;
   StopRequest *stop_request_ = nullptr;
+  Trajectory *trajectory_ = nullptr;
   TSHandle ts_;
   MatHandle matrix_;
   VecHandle state_, local_, rate_, local_residual_, before_;

@@ -118,6 +118,7 @@ public:
   PetscErrorCode announce(SceneFacts &facts) override
   {
     facts.ventilator = std::make_shared<Programme>(programme());
+    facts.programme_again = [this](bool settles) { return programme(settles); };
     facts.settling.off = settle_ == "off" && begins_with_breath() && !settles();
     facts.settling.pressure = starting_pressure() != 0;
     if (settle_ == "auto" && begins_with_breath() && !settles())

@@ -1,0 +1,90 @@
+/// @file
+/// The discrete adjoint of a run: one sweep back over its steps gives the derivative of clinical numbers by all that
+/// the steps depend on.
+#pragma once
+
+#include "pulmo/adjoint/functional.hpp"
+#include "pulmo/time/simulation.hpp"
+
+#include <functional>
+#include <map>
+
+namespace pulmo {
+
+/// Goes back over the accepted stages of a run. With R_n(x_n, x_n-1, ...) = 0 the equations of stage n and G a number
+/// of the signals,
+///
+///   (dR_n/dx_n)^T z_n = - dG/dx_n - sum over later stages m of (dR_m/dx_n)^T z_m,
+///   dG/dp = sum over all n of z_n . dR_n/dp.
+///
+/// The matrix is the transposed Jacobian of the stage, in the run's own matrix and by its own solver. Where the
+/// pressure at the opening is an unknown its equation c(P, V) = 0 has a multiplier of its own, eliminated as in
+/// ScalarUnknowns. The consistent flux into a held airway is a sum of rows of R_n: its derivative stands in z_n at
+/// these nodes.
+class Sweep {
+public:
+  Sweep(const Scene &scene, Model &model, Simulation &simulation, const Trajectory &trajectory)
+      : scene_(scene), model_(model), simulation_(simulation), trajectory_(trajectory)
+  {}
+
+  /// What keeps the sweep from this scene, as the end of a sentence; empty: nothing does.
+  static std::string obstacle(const Scene &scene, const Model &model);
+
+  /// What is known once a stage was solved.
+  struct Solved {
+    const StageRecord &record;
+    Vec state, rate;                  ///< local, of the stage
+    std::vector<Vec> adjoint;         ///< [functional]: z, local, with the rows of a held airway
+    std::vector<PetscReal> by_target; ///< [functional]: its derivative by StageRecord::airway.target
+  };
+  using Visit = std::function<PetscErrorCode(const Solved &)>;
+
+  /// Sweeps back for all @p functionals at once. @p tolerance: of the linear systems, relative. @p visit is called
+  /// after each stage that matters, with the model told of it. @p failure: why there is no result; empty if there is
+  /// one.
+  PetscErrorCode run(const std::vector<Functional> &functionals, PetscReal tolerance, const Visit &visit,
+                     std::string &failure);
+
+  PetscInt solves() const { return solves_; }
+  PetscInt krylov() const { return krylov_; }
+
+private:
+  /// What later stages and the number itself want of a stage.
+  struct Wanted {
+    VecHandle state;                              ///< local, to be summed over the ranks; null: nothing
+    PetscReal volume = 0, pressure = 0, flow = 0; ///< per mm^3, kPa (at the opening), mm^3/s
+  };
+  using Pending = std::map<PetscInt, std::vector<Wanted>>;
+
+  PetscErrorCode setup();
+  PetscErrorCode create(VecHandle &local) const;
+  Wanted &wanted(Pending &pending, PetscInt stage, std::size_t functional) const;
+  /// Adds a derivative by the pressure at the ventilator at the end of a stage, 1/kPa.
+  void want_ventilator_pressure(PetscInt stage, PetscReal derivative, Wanted &wanted) const;
+  /// Makes the model that of a stage; fills x_ and rate_.
+  PetscErrorCode recall(const StageRecord &record, PetscInt number);
+  /// Derivative of the local residual by the pressure at the opening, 1/kPa, or by the flow prescribed on a free
+  /// airway, s/mm^3.
+  PetscErrorCode make_column(const StageRecord &record);
+  PetscErrorCode solve(Vec right, Vec solution, std::string &failure);
+  PetscErrorCode to_global(Vec local, Vec global) const;
+  PetscErrorCode to_local(Vec global, Vec local) const;
+  PetscErrorCode dot(Vec a, Vec b, PetscReal &sum) const;
+  /// Adds (dR/dx_i)^T z for the stages that @p record looks back at.
+  PetscErrorCode look_back(const StageRecord &record, Vec z, std::size_t functional, Pending &pending);
+  /// Whether rates act in the kernels by more than the gas that is stored.
+  PetscErrorCode compare_rates(const StageRecord &record, Vec z);
+
+  const Scene &scene_;
+  Model &model_;
+  Simulation &simulation_;
+  const Trajectory &trajectory_;
+  bool gas_ = false; ///< there is a mass balance
+  std::optional<bool> other_rates_;
+  std::vector<PetscReal> volumes_, flows_; ///< [stage]: mm^3; through the opening, mm^3/s
+  VecHandle x_, rate_, past_, column_, work_, other_;
+  VecHandle right_, held_, product_;
+  PetscInt solves_ = 0, krylov_ = 0;
+};
+
+} // namespace pulmo

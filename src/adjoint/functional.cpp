@@ -1,0 +1,175 @@
+#include "pulmo/adjoint/functional.hpp"
+
+#include "pulmo/base/units.hpp"
+#include "pulmo/observers/clinical.hpp"
+
+#include <algorithm>
+#include <functional>
+
+namespace pulmo {
+
+namespace {
+
+using Rows = std::vector<SignalRow>;
+
+/// What all numbers of a run are made of: its last complete breath, and the row at which the first one began.
+struct Breath {
+  const Rows &rows;
+  std::size_t rest, first, last;
+  ClinicalNumbers numbers;
+};
+
+/// The row of (first, last] with the largest @p value.
+std::size_t largest(const Breath &b, const std::function<double(const SignalRow &)> &value)
+{
+  std::size_t most = b.first + 1;
+  for (std::size_t i = most; i <= b.last; ++i)
+    if (value(b.rows[i]) > value(b.rows[most])) most = i;
+  return most;
+}
+
+bool tidal_volume(const Breath &b, Functional &f)
+{
+  if (!b.numbers.takes_in) return false;
+  f.value = b.numbers.tidal_volume;
+  f.by_volume[largest(b, [](const SignalRow &r) { return r.volume; })] += 1;
+  f.by_volume[b.first] -= 1;
+  return true;
+}
+
+bool peak_pressure(const Breath &b, Functional &f)
+{
+  f.value = b.numbers.peak_pressure;
+  const std::size_t i = largest(b, [](const SignalRow &r) { return r.machine_pressure(); });
+  f.by_pressure[b.rows[i].machine_pressure() > b.rows[b.first].machine_pressure() ? i : b.first] = 1;
+  return true;
+}
+
+bool plateau_pressure(const Breath &b, Functional &f)
+{
+  if (!b.numbers.plateau_pressure) return false;
+  f.value = *b.numbers.plateau_pressure;
+  f.by_pressure[end_of_inspiration(b.rows, b.first, b.last)] = 1;
+  return true;
+}
+
+bool peak_flow(const Breath &b, Functional &f)
+{
+  if (!(b.numbers.peak_flow > 0)) return false;
+  f.value = b.numbers.peak_flow;
+  f.by_flow[largest(b, [](const SignalRow &r) { return r.flow; })] = 1;
+  return true;
+}
+
+bool peak_expiratory_flow(const Breath &b, Functional &f)
+{
+  if (!(b.numbers.peak_expiratory_flow > 0)) return false;
+  f.value = b.numbers.peak_expiratory_flow;
+  f.by_flow[largest(b, [](const SignalRow &r) { return -r.flow; })] = -1;
+  return true;
+}
+
+/// Derivatives of E and R of the fit P = E V + R Q (eq. 52) times @p by_E (cmH2O/ml) and @p by_R (cmH2O s/ml).
+///
+/// The normal equations sum w V r = 0 and sum w Q r = 0 with r = P - E V - R Q are differentiated as they stand.
+void add_fit(const Breath &b, double by_E, double by_R, Functional &f)
+{
+  const double P_rest = b.rows[b.rest].machine_pressure(), V_rest = b.rows[b.rest].volume,
+               E = 1 / b.numbers.compliance.value(), R = b.numbers.resistance.value_or(0) / 1000;
+  double VV = 0, VQ = 0, QQ = 0;
+  for (std::size_t i = b.first + 1; i <= b.last; ++i) {
+    const SignalRow &r = b.rows[i];
+    const double V = r.volume - V_rest;
+    VV += r.dt * V * V;
+    VQ += r.dt * V * r.flow;
+    QQ += r.dt * r.flow * r.flow;
+  }
+  const double determinant = VV * QQ - VQ * VQ, y_V = (by_E * QQ - by_R * VQ) / determinant,
+               y_Q = (by_R * VV - by_E * VQ) / determinant;
+  for (std::size_t i = b.first + 1; i <= b.last; ++i) {
+    const SignalRow &r = b.rows[i];
+    const double V = r.volume - V_rest, Q = r.flow, P = r.machine_pressure() - P_rest, left = P - E * V - R * Q,
+                 along = r.dt * (y_V * V + y_Q * Q), by_V = r.dt * y_V * left - E * along;
+    f.by_volume[i] += by_V;
+    f.by_volume[b.rest] -= by_V;
+    f.by_pressure[i] += along;
+    f.by_pressure[b.rest] -= along;
+    f.by_flow[i] += r.dt * y_Q * left - R * along;
+  }
+}
+
+bool compliance(const Breath &b, Functional &f)
+{
+  if (!b.numbers.compliance || !b.numbers.resistance) return false; // a fit without flow is another one
+  f.value = *b.numbers.compliance;
+  add_fit(b, -f.value * f.value, 0, f);
+  return true;
+}
+
+bool resistance(const Breath &b, Functional &f)
+{
+  if (!b.numbers.compliance || !b.numbers.resistance) return false;
+  f.value = *b.numbers.resistance;
+  add_fit(b, 0, 1000, f);
+  return true;
+}
+
+/// The closed integral of (P - PEEP) dV by trapezoids.
+bool work(const Breath &b, Functional &f)
+{
+  const double peep = b.rows[b.first].machine_pressure(), j = units::kPa_per_cmH2O * 1e-3;
+  f.value = b.numbers.work;
+  for (std::size_t i = b.first + 1; i <= b.last; ++i) {
+    const SignalRow &r = b.rows[i], &before = b.rows[i - 1];
+    const double mean = (r.machine_pressure() + before.machine_pressure()) / 2 - peep, dV = r.volume - before.volume;
+    f.by_volume[i] += j * mean;
+    f.by_volume[i - 1] -= j * mean;
+    f.by_pressure[i] += j * dV / 2;
+    f.by_pressure[i - 1] += j * dV / 2;
+    f.by_pressure[b.first] -= j * dV;
+  }
+  return true;
+}
+
+/// A number, and how it is made; false where the run does not define it.
+struct Known {
+  const char *key, *name, *unit;
+  bool (*make)(const Breath &, Functional &);
+};
+
+constexpr Known known[] = {
+    {"tidal_volume_ml", "V_T", "ml", tidal_volume},
+    {"compliance_ml_per_cmH2O", "C_rs", "ml/cmH2O", compliance},
+    {"resistance_cmH2O_s_per_l", "R", "cmH2O s/l", resistance},
+    {"peak_inspiratory_pressure_cmH2O", "PIP", "cmH2O", peak_pressure},
+    {"plateau_pressure_cmH2O", "P_plat", "cmH2O", plateau_pressure},
+    {"peak_flow_ml_per_s", "Q_peak", "ml/s", peak_flow},
+    {"peak_expiratory_flow_ml_per_s", "Q_exp", "ml/s", peak_expiratory_flow},
+    {"work_j", "work", "J", work},
+};
+
+} // namespace
+
+std::vector<std::string> functional_names()
+{
+  std::vector<std::string> names;
+  for (const Known &k : known) names.emplace_back(k.name);
+  return names;
+}
+
+std::optional<Functional> functional(const std::string &name, const Rows &rows)
+{
+  const auto breaths = complete_breaths(rows);
+  const Known *k = std::find_if(std::begin(known), std::end(known), [&](const Known &one) { return name == one.name; });
+  if (k == std::end(known) || breaths.empty()) return {};
+  Functional f;
+  f.key = k->key;
+  f.name = k->name;
+  f.unit = k->unit;
+  for (auto *gradient : {&f.by_volume, &f.by_pressure, &f.by_flow}) gradient->assign(rows.size(), 0);
+  const Breath breath{rows, breaths.front().first, breaths.back().first, breaths.back().last, overall_numbers(rows)};
+  if (!k->make(breath, f)) return {};
+  return f;
+}
+
+} // namespace pulmo

@@ -1,0 +1,213 @@
+#include "pulmo/adjoint/sensitivities.hpp"
+
+#include "pulmo/input/errors.hpp"
+#include "pulmo/physics/parameter_fields.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+namespace pulmo {
+
+namespace {
+
+/// A parameter is moved by this share of itself for the derivative of the residual by it: the quotient is off by as
+/// much as rounding in the residual then.
+constexpr PetscReal difference = 1e-7;
+
+/// A parameter of the scene: of kernels, or of the ventilator.
+struct Parameter {
+  Options::RealOption option;
+  PetscInt constant = -1;        ///< its place among those of kernels (Composition::constant_at)
+  bool on_facets = false;        ///< nothing in the volume reads it
+  std::vector<Phase> less, more; ///< the ventilator's phases with less and more of it
+  PetscReal change() const { return difference * std::abs(*option.target); }
+};
+
+/// The phases of the ventilator with setting @p option changed by @p change.
+std::vector<Phase> phases_with(const SceneFacts &facts, const Options::RealOption &option, PetscReal change)
+{
+  const PetscReal value = *option.target;
+  const auto laid_out = [&] {
+    auto phases = facts.programme_again(false).phases();
+    if (phases.size() < facts.ventilator->phases().size()) phases = facts.programme_again(true).phases();
+    return phases;
+  };
+  *option.target = value + change;
+  std::vector<Phase> phases = laid_out();
+  *option.target = value;
+  return phases;
+}
+
+/// Whether two lists of phases differ in nothing but in what they prescribe.
+bool same_times(const std::vector<Phase> &a, const std::vector<Phase> &b)
+{
+  return a.size() == b.size() && std::equal(a.begin(), a.end(), b.begin(), [](const Phase &p, const Phase &q) {
+           return p.begin == q.begin && p.end == q.end && p.ramp == q.ramp && p.dt == q.dt;
+         });
+}
+
+bool same_targets(const std::vector<Phase> &a, const std::vector<Phase> &b)
+{
+  return std::equal(a.begin(), a.end(), b.begin(), [](const Phase &p, const Phase &q) {
+    return p.to == q.to && p.from == q.from && p.limit == q.limit;
+  });
+}
+
+/// What the phase of @p record would prescribe there by @p phases, but for what it began with.
+PetscReal target(const StageRecord &record, const std::vector<Phase> &phases)
+{
+  const Phase &phase = phases[static_cast<std::size_t>(record.phase)];
+  if (record.airway.limited) return phase.limit.value_or(0);
+  if (record.airway.control == Control::flow) return phase.delivered(record.time);
+  return phase.to + (phase.from.value_or(0) - phase.to) * record.airway.share;
+}
+
+/// The parameters of a scene that are not zero and do not differ from place to place. Those that move the ends of
+/// phases are left out: steps land there.
+std::vector<Parameter> parameters_of(const Options &options, const Scene &scene, const Composition &composition)
+{
+  const SceneFacts &facts = scene.facts();
+  std::vector<PetscInt> varying;
+  std::vector<Parameter> list;
+  if (composition.varying()) varying = composition.varying()->offsets();
+  for (const Options::RealOption &option : options.real_options()) {
+    const char *owner = nullptr;
+    Parameter p;
+    p.option = option;
+    p.constant = composition.constant_at(option.target, &owner);
+    if (*option.target == 0 || std::find(varying.begin(), varying.end(), p.constant) != varying.end()) continue;
+    if (p.constant < 0) {
+      p.less = phases_with(facts, option, -p.change());
+      p.more = phases_with(facts, option, p.change());
+      if (!same_times(p.less, p.more) || same_targets(p.less, p.more)) continue;
+    } else {
+      p.on_facets = composition.derived().empty() && composition.read_on_surfaces_alone(owner);
+    }
+    list.push_back(std::move(p));
+  }
+  return list;
+}
+
+} // namespace
+
+PetscErrorCode Sensitivities::declare(Options &options)
+{
+  std::string known;
+
+  PetscFunctionBeginUser;
+  for (const std::string &name : functional_names()) known += (known.empty() ? "" : ", ") + name;
+  options.group("sensitivities", "derivatives of clinical numbers by the parameters of the scene");
+  PetscCall(
+      options.names("", "after the run, one sweep back gives the derivatives of these numbers: " + known, names_));
+  options.group("sensitivities", "", in_use(), "-sensitivities");
+  PetscCall(options.real("memory", "MB", Range::not_negative(),
+                         "for the states of the run on each rank; more of them go to a file in the output directory",
+                         memory_));
+  PetscCall(options.real("rtol", "-", Range::between(1e-14, 0.1), "relative tolerance of the sweep's linear systems",
+                         tolerance_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Sensitivities::check(const Options &options, const Scene &scene, const Model &model, bool restarts) const
+{
+  const std::vector<std::string> known = functional_names();
+  std::string list;
+
+  PetscFunctionBeginUser;
+  if (!in_use()) PetscFunctionReturn(PETSC_SUCCESS);
+  for (const std::string &name : known) list += (list.empty() ? "" : ", ") + name;
+  for (const std::string &name : names_)
+    PulmoUserCheck(std::find(known.begin(), known.end(), name) != known.end(), options.comm(),
+                   "-sensitivities knows no number '%s'; give some of %s", name.c_str(), list.c_str());
+  const std::string obstacle = Sweep::obstacle(scene, model);
+  PulmoUserCheck(obstacle.empty(), options.comm(), "-sensitivities %s; or leave the option out", obstacle.c_str());
+  PulmoUserCheck(!restarts, options.comm(),
+                 "-sensitivities needs the states of the whole run, and a restart has not those before it; run from "
+                 "the start, or leave the option out");
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Sensitivities::attach(Simulation &simulation, const std::string &folder)
+{
+  PetscFunctionBeginUser;
+  if (!in_use()) PetscFunctionReturn(PETSC_SUCCESS);
+  trajectory_ = std::make_unique<Trajectory>(static_cast<std::size_t>(memory_ * 1e6), folder);
+  simulation.record(*trajectory_);
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Sensitivities::make(const Options &options, const Scene &scene, Model &model, Simulation &simulation,
+                                   const std::vector<SignalRow> &rows, SensitivityReport &report)
+{
+  const std::vector<Parameter> parameters = parameters_of(options, scene, model.composition());
+  Sweep sweep(scene, model, simulation, *trajectory_);
+  std::vector<Functional> functionals;
+  VecHandle all, on_facets, moved; // residuals
+  PetscLogDouble begin, end;
+  PetscMPIInt rank;
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Comm_rank(options.comm(), &rank));
+  PetscCall(PetscTime(&begin));
+  for (const std::string &name : names_) {
+    const auto f = functional(name, rows);
+    if (!f) {
+      report.undefined.push_back(name);
+      continue;
+    }
+    functionals.push_back(*f);
+    report.numbers.push_back({f->key, f->name, f->unit, f->value});
+  }
+  for (const Parameter &p : parameters)
+    report.parameters.push_back(
+        {p.option.option, p.option.unit, *p.option.target, std::vector<double>(report.numbers.size(), 0)});
+  for (VecHandle *F : {&all, &on_facets, &moved}) PetscCall(DMCreateLocalVector(model.dm(), F->out()));
+  const auto residual = [&](const Sweep::Solved &stage, bool facets, Vec F) -> PetscErrorCode {
+    const StageRecord &record = stage.record;
+    PetscFunctionBeginUser;
+    PetscCall(model.set_step(record.stage, record.airway.pressure, record.airway.flow));
+    if (facets)
+      PetscCall(model.facet_residual(record.time, stage.state, stage.rate, F));
+    else
+      PetscCall(model.residual(record.time, stage.state, stage.rate, F));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  };
+  const auto visit = [&](const Sweep::Solved &stage) -> PetscErrorCode {
+    const StageRecord &record = stage.record;
+    PetscFunctionBeginUser;
+    PetscCall(residual(stage, false, all));
+    PetscCall(residual(stage, true, on_facets));
+    for (std::size_t i = 0; i < parameters.size(); ++i) {
+      const Parameter &p = parameters[i];
+      std::vector<double> &derivative = report.parameters[i].derivative;
+      const PetscReal change = p.change();
+      if (p.constant < 0) {
+        const PetscReal by_parameter = (target(record, p.more) - target(record, p.less)) / (2 * change);
+        for (std::size_t k = 0; k < derivative.size(); ++k)
+          derivative[k] += rank == 0 ? stage.by_target[k] * by_parameter : 0;
+        continue;
+      }
+      model.change_parameter(p.constant, change);
+      PetscCall(residual(stage, p.on_facets, moved));
+      model.change_parameter(p.constant, 0);
+      PetscCall(VecAXPY(moved, -1, p.on_facets ? on_facets : all));
+      for (std::size_t k = 0; k < derivative.size(); ++k) {
+        PetscReal sum;
+        PetscCall(VecDot(moved, stage.adjoint[k], &sum));
+        derivative[k] += sum / change;
+      }
+    }
+    PetscFunctionReturn(PETSC_SUCCESS);
+  };
+  if (!report.numbers.empty()) PetscCall(sweep.run(functionals, tolerance_, visit, report.failure));
+  for (SensitivityReport::Parameter &row : report.parameters)
+    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, row.derivative.data(), static_cast<PetscMPIInt>(row.derivative.size()),
+                               MPIU_REAL, MPI_SUM, options.comm()));
+  PetscCall(PetscTime(&end));
+  report.seconds = end - begin;
+  report.solves = static_cast<int>(sweep.solves());
+  report.krylov = static_cast<int>(sweep.krylov());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace pulmo
