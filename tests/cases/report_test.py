@@ -96,7 +96,8 @@ class Runs(unittest.TestCase):
         cls.case = pulmo.finished(pulmo.DIRECT + pulmo.PCV + WEIGHT + pulmo.LUNG + COARSE +
                                   ["-output_fields_every", "0.5", "-ventilator_pause", "0.2", "-tube", "-tube_k1", "4"])
         cls.other = pulmo.finished(pulmo.DIRECT + pulmo.VCV + pulmo.LITRE + COARSE +
-                                   ["-ventilator_tidal_volume", "80", "-ventilator_peep", "2", "-error_estimate"])
+                                   ["-ventilator_tidal_volume", "80", "-ventilator_peep", "2", "-error_estimate", "-sensitivities",
+                                    "C_rs,PIP"])
         cls.failed = pulmo.Case(pulmo.DIRECT + pulmo.CUBE + ["-airflow", "-chest_wall", "-snes_max_it", "1", "-ts_dt", "0.1"] +
                                 pulmo.programme("rest 0.2 pressure 0\npush 0.2 pressure 5\n"))
         assert cls.failed.code == 2, cls.failed.tail()

@@ -1,0 +1,89 @@
+#!/usr/bin/python3
+"""-sensitivities: the program's table and summary, ranks, states in a file, what is refused, and that a scene without it pays nothing."""
+import os
+import unittest
+
+import pulmo_case as pc
+
+SCENE = (pc.BLOCK + pc.QUIET + pc.PAPER + pc.DIRECT + ["-ts_dt", "0.1", "-snes_rtol", "1e-12", "-snes_atol", "1e-12"] +
+         ["-tissue", "yoshihara", "-airflow", "-airflow_permeability", "100", "-airflow_surfaces", "x1", "-chest_wall",
+          "-chest_wall_surfaces", "x0,y0,y1,z0,z1", "-ventilator", "vcv", "-ventilator_tidal_volume", "200", "-ventilator_ramp_down", "0.3",
+          "-ventilator_inspiration", "0.5", "-ventilator_expiration", "0.8", "-energy_audit", "off"])
+ASK = ["-sensitivities", "C_rs,R,PIP,V_T", "-sensitivities_rtol", "1e-12"]
+
+
+def table(case, column="derivative"):
+    """{number: {option: derivative}}"""
+    return {key: {option: one[column] for option, one in given["parameters"].items()}
+            for key, given in case.json()["sensitivities"]["numbers"].items()}
+
+
+class Sensitivities(unittest.TestCase):
+    def same(self, a, b, share):
+        """Two runs, to a share of each entry, or of a percent for a percent where that is more."""
+        one, other = (table(case, "percent_for_one_percent_more") for case in (a, b))
+        self.assertEqual(one.keys(), other.keys())
+        for key, derivatives in one.items():
+            self.assertEqual(derivatives.keys(), other[key].keys())
+            for option, value in derivatives.items():
+                self.assertAlmostEqual(other[key][option], value, delta=share * max(abs(value), 1), msg=f"{key} by {option}")
+
+    def test_ranks_file_and_solver(self):
+        """Held against a run with another stiffness, then against itself on 2 and 3 ranks, from a file, and with Krylov methods."""
+        run = pc.finished(SCENE + ASK)
+        one, summary = table(run), run.json()
+        self.assertIn("1 % more of it changes", run.out)
+        self.assertEqual(list(one), ["compliance_ml_per_cmH2O", "resistance_cmH2O_s_per_l", "peak_inspiratory_pressure_cmH2O", "tidal_volume_ml"])
+        self.assertGreater(len(one["tidal_volume_ml"]), 6)
+        # the volume is prescribed
+        self.assertAlmostEqual(one["tidal_volume_ml"]["-ventilator_tidal_volume"], 1, delta=1e-9)
+        self.assertAlmostEqual(one["tidal_volume_ml"]["-tissue_c"], 0, delta=1e-6)
+        c = summary["sensitivities"]["numbers"]["compliance_ml_per_cmH2O"]["parameters"]["-tissue_c"]
+        moved = [pc.finished(SCENE + ["-tissue_c", repr(c["value"] * (1 + s))]).json() for s in (-1e-3, 1e-3)]
+        for key in ("compliance_ml_per_cmH2O", "resistance_cmH2O_s_per_l", "peak_inspiratory_pressure_cmH2O"):
+            self.assertAlmostEqual((moved[1][key] - moved[0][key]) / (2e-3 * c["value"]), one[key]["-tissue_c"],
+                                   delta=1e-5 * abs(one[key]["-tissue_c"]), msg=key)
+        for ranks in (2, 3):
+            with self.subTest(ranks=ranks):
+                self.same(run, pc.finished(SCENE + ASK, ranks=ranks), 1e-7)
+        file = pc.finished(SCENE + ASK + ["-sensitivities_memory", "0"])
+        self.same(run, file, 1e-12)
+        self.assertEqual([name for name in os.listdir(file.directory) if "trajectory" in name], [])
+        krylov = pc.finished(SCENE[:len(pc.BLOCK + pc.QUIET + pc.PAPER)] + pc.options_file("solvers/iterative.opts") +
+                             SCENE[len(pc.BLOCK + pc.QUIET + pc.PAPER + pc.DIRECT):] + ASK)
+        self.same(run, krylov, 1e-6)
+
+    def test_what_is_not_asked_for_is_not_there(self):
+        case = pc.finished(SCENE)
+        self.assertNotIn("sensitivities", case.json())
+        self.assertNotIn("1 % more", case.out)
+
+    def test_numbers_that_the_run_has_not(self):
+        case = pc.finished(SCENE + ["-ventilator_pause", "0", "-sensitivities", "P_plat,V_T"])
+        self.assertIn("this run has no P_plat", case.out)
+        self.assertEqual(list(case.json()["sensitivities"]["numbers"]), ["tidal_volume_ml"])
+        self.assertEqual(case.json()["sensitivities"]["not_defined"], ["P_plat"])
+
+    def test_refused(self):
+        for options, words in ((["-sensitivities", "C_rs,compliance"], "knows no number 'compliance'"),
+                               (["-sensitivities", "C_rs", "-viscoelastic"], "-viscoelastic"),
+                               (["-sensitivities", "C_rs", "-airway_tree", "star"], "-airway_tree"),
+                               (["-sensitivities", "C_rs", "-petscfe_type", "basic"], "-petscfe_type"),
+                               (["-sensitivities_rtol", "1e-3"], "-sensitivities"),
+                               (["-sensitivities", "C_rs", "-sensitivities_rtol", "0"], "out of range")):
+            with self.subTest(options=options):
+                case = pc.Case(SCENE + options)
+                self.assertEqual(case.code, 1, case.tail())
+                self.assertIn(words, case.err)
+        with self.subTest("no ventilator"):
+            case = pc.Case(SCENE + ["-ventilator", "off", "-ventilator_tidal_volume", "1", "-sensitivities", "C_rs"])
+            self.assertEqual(case.code, 1, case.tail())
+        with self.subTest("restart"):
+            half = pc.finished(SCENE + ["-ts_max_time", "0.4", "-checkpoint_every", "0.1"])
+            case = pc.Case(SCENE + ["-restart", os.path.join(half.directory, "checkpoint.h5"), "-sensitivities", "C_rs"])
+            self.assertEqual(case.code, 1, case.tail())
+            self.assertIn("a restart has not those before it", case.err)
+
+
+if __name__ == "__main__":
+    pc.main()

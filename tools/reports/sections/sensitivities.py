@@ -1,0 +1,24 @@
+"""By how many percent each number changes where a parameter grows by one."""
+from ..charts import number
+from ..read import Missing
+from .numbers import ROWS
+
+NAME, TITLE = "sensitivities", "What the numbers hang on"
+
+
+def build(run):
+    told = run.summary.get("sensitivities")
+    if not told:
+        raise Missing("The run was not asked for derivatives: -sensitivities C_rs,R,V_T gives them from one sweep back over it.")
+    if told["failure"]:
+        raise Missing(f"There are none: {told['failure']}.")
+    numbers = told["numbers"]
+    if not numbers:
+        raise Missing("The run defines none of the numbers that were asked for.")
+    options = list(next(iter(numbers.values()))["parameters"])
+    rows = []
+    for option in options:
+        of = [given["parameters"][option] for given in numbers.values()]
+        rows.append({"option": option, "value": number(of[0]["value"]), "unit": of[0]["unit"].replace("H2O", "H₂O"),
+                     "values": [f"{one['percent_for_one_percent_more']:+.2f}".replace("-", "−") for one in of]})
+    return {"heads": [ROWS[key][0] for key in numbers], "rows": rows, "seconds": number(told["seconds"], 3)}
