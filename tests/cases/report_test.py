@@ -190,6 +190,16 @@ class Runs(unittest.TestCase):
             row, bar = rows[sections.numbers.ROWS[key][0]], summary["error_estimate"]["numbers"][key]["error"]
             self.assertAlmostEqual(number(row[2].removeprefix("± ")), bar, delta=0.06 * abs(bar), msg=key)
 
+    def test_sensitivities_are_those_of_the_summary(self):
+        told = self.other.json()["sensitivities"]["numbers"]
+        shown = Page(page.page(of_run.load([self.other.directory]))).section("sensitivities")["text"]
+        parameters = told["compliance_ml_per_cmH2O"]["parameters"]
+        self.assertGreater(len(parameters), 5)
+        for option, one in parameters.items():
+            self.assertIn(option, shown)
+            self.assertIn(f"{one['percent_for_one_percent_more']:+.2f}".replace("-", "−"), shown, option)
+        self.assertIn("-sensitivities", self.page.section("sensitivities")["text"], "how to get them")
+
     def test_two_runs_side_by_side(self):
         names = [os.path.basename(os.path.abspath(c.directory)) for c in (self.case, self.other)]
         names = names if names[0] != names[1] else [self.case.directory, self.other.directory]

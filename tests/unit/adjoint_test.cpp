@@ -3,8 +3,10 @@
 
 #include "pulmo/adjoint/sensitivities.hpp"
 #include "pulmo/base/units.hpp"
+#include "pulmo/mesh/mesh.hpp"
 #include "pulmo/observers/clinical.hpp"
 
+#include <algorithm>
 #include <cmath>
 
 namespace pulmo::test {
@@ -47,13 +49,176 @@ PetscErrorCode run_scene(const std::string &options, bool sweeps, Swept &result)
 /// A breath on the cube of 24 cells.
 struct Breath {
   const char *name, *options;
-  double share = 1e-3; ///< by which parameters are moved
-  bool cut = false;    ///< steps are cut
+  double share = 1e-3;  ///< by which parameters are moved
+  bool cut = false;     ///< steps are cut
+  bool forward = false; ///< Tangent knows it
 };
 
 std::ostream &operator<<(std::ostream &out, const Breath &b)
 {
   return out << b.name;
+}
+
+/// The forward sensitivity of a run to one parameter of its kernels: the linearised steps, one after the other. Pasts
+/// come from matrices of the Jacobian with and without its rates, where the sweep has the derivative of the volume.
+class Tangent {
+public:
+  Tangent(SceneRun &run, const Trajectory &trajectory, PetscInt constant, PetscReal change)
+      : model_(run.model()), rows_(run.simulation().rows()), trajectory_(trajectory), constant_(constant),
+        change_(change)
+  {}
+
+  /// Fills @p volume, @p pressure and @p flow with the derivatives of the rows: mm^3, kPa and mm^3/s for each unit.
+  PetscErrorCode run(std::vector<PetscReal> &volume, std::vector<PetscReal> &pressure, std::vector<PetscReal> &flow);
+
+private:
+  PetscErrorCode residual(const StageRecord &r, Vec x, Vec x_t, PetscReal P, PetscReal Q, Vec F)
+  {
+    PetscFunctionBeginUser;
+    PetscCall(model_.set_step(r.stage, P, Q));
+    PetscCall(model_.residual(r.time, x, x_t, local_F_));
+    PetscCall(VecZeroEntries(F));
+    PetscCall(DMLocalToGlobal(model_.dm(), local_F_, ADD_VALUES, F));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+  Model &model_;
+  const std::vector<SignalRow> &rows_;
+  const Trajectory &trajectory_;
+  PetscInt constant_;
+  PetscReal change_;
+  VecHandle local_F_;
+};
+
+PetscErrorCode Tangent::run(std::vector<PetscReal> &volume, std::vector<PetscReal> &pressure_,
+                            std::vector<PetscReal> &flow)
+{
+  const DM dm = model_.dm();
+  const PetscReal L = model_.composition().mesh().length();
+  VecHandle x, x_t, before, moved, moved_t, direction;           // local
+  VecHandle now, last, by_parameter, by_scalar, F, right, other; // global
+  MatHandle A, A0;
+  std::vector<PetscReal> V(trajectory_.stages().size(), 0), P = V;
+
+  PetscFunctionBeginUser;
+  for (VecHandle *v : {&x, &x_t, &before, &moved, &moved_t, &direction, &local_F_})
+    PetscCall(DMCreateLocalVector(dm, v->out()));
+  for (VecHandle *v : {&now, &last, &by_parameter, &by_scalar, &F, &right, &other})
+    PetscCall(DMCreateGlobalVector(dm, v->out()));
+  PetscCall(model_.create_matrix(A.out()));
+  PetscCall(model_.create_matrix(A0.out()));
+  volume.assign(rows_.size(), 0);
+  pressure_ = flow = volume;
+  for (std::size_t n = 1; n < trajectory_.stages().size(); ++n) {
+    const StageRecord &r = trajectory_.stages()[n];
+    const Airway::Condition &airway = r.airway;
+    const bool free = airway.mode == Airway::Mode::free, solved = airway.mode == Airway::Mode::solved;
+    const PetscReal slope = r.stage.slope;
+    PetscCall(trajectory_.state(static_cast<PetscInt>(n), x));
+    PetscCall(trajectory_.state(r.past[0], before));
+    PetscCall(VecWAXPY(x_t, -1, before, x));
+    PetscCall(VecScale(x_t, slope));
+    model_.set_load(r.load);
+    PetscCall(residual(r, x, x_t, airway.pressure, airway.flow, F));
+    // by the parameter
+    model_.change_parameter(constant_, change_);
+    PetscCall(residual(r, x, x_t, airway.pressure, airway.flow, by_parameter));
+    model_.change_parameter(constant_, 0);
+    PetscCall(VecAXPBY(by_parameter, -1 / change_, 1 / change_, F));
+    // by the pressure of a held airway, or the flow prescribed on a free one
+    const PetscReal step = free ? slope * L * L * L : model_.modulus();
+    PetscCall(VecCopy(x, moved));
+    PetscCall(VecCopy(x_t, moved_t));
+    if (!free) {
+      PetscCall(model_.airway().fill(moved, airway.pressure + step));
+      PetscCall(VecZeroEntries(direction));
+      PetscCall(model_.airway().fill(direction, step * slope));
+      PetscCall(VecAXPY(moved_t, 1, direction));
+    }
+    PetscCall(
+        residual(r, moved, moved_t, airway.pressure + (free ? 0 : step), airway.flow + (free ? step : 0), by_scalar));
+    PetscCall(VecAXPBY(by_scalar, -1 / step, 1 / step, F));
+    PetscCall(model_.set_step(r.stage, airway.pressure, airway.flow));
+    // rows and columns of the airway as they are
+    model_.airway().hold(false);
+    PetscCall(model_.jacobian(r.time, x, x_t, slope, A));
+    PetscCall(model_.jacobian(r.time, x, x_t, 0, A0));
+    model_.airway().hold(!free);
+    PetscCall(MatMult(A, last, right)); // -(dR/dx_n-1) x'_n-1 = (A - A0) x'_n-1
+    PetscCall(MatMult(A0, last, other));
+    PetscCall(VecAXPY(right, -1, other));
+    PetscCall(VecAXPY(right, -1, by_parameter));
+    // what is prescribed changes with the volume or pressure at the start of the phase
+    const auto start = static_cast<std::size_t>(r.phase_start);
+    const PetscReal target = airway.by_start * (airway.control == Control::flow ? V[start] : P[start]);
+    PetscReal scalar = 0, V_fixed = 0, V_border = 0;
+    KSP ksp;
+    PC pc;
+    const auto solve = [&](Vec b, Vec y) -> PetscErrorCode {
+      PetscFunctionBeginUser;
+      if (!free) PetscCall(model_.airway().set(b, 0));
+      PetscCall(KSPSolve(ksp, b, y));
+      PetscFunctionReturn(PETSC_SUCCESS);
+    };
+    const auto volume_of = [&](Vec y, PetscReal &value) -> PetscErrorCode {
+      PetscFunctionBeginUser;
+      PetscCall(VecZeroEntries(direction));
+      PetscCall(DMGlobalToLocal(dm, y, INSERT_VALUES, direction));
+      PetscCall(model_.volume_derivative(x, direction, value));
+      PetscFunctionReturn(PETSC_SUCCESS);
+    };
+    MatHandle closed;
+    PetscCall(MatDuplicate(A, MAT_COPY_VALUES, closed.out()));
+    PetscCall(model_.airway().close_rows(closed, false));
+    PetscCall(KSPCreate(PetscObjectComm((PetscObject)dm), &ksp));
+    PetscCall(KSPSetType(ksp, KSPPREONLY));
+    PetscCall(KSPGetPC(ksp, &pc));
+    PetscCall(PCSetType(pc, PCLU));
+    PetscCall(PCFactorSetMatSolverType(pc, MATSOLVERMUMPS));
+    PetscCall(KSPSetOperators(ksp, closed, closed));
+    VecHandle kept, border, of_scalar;
+    PetscCall(VecDuplicate(right, kept.out()));
+    PetscCall(VecDuplicate(right, border.out()));
+    PetscCall(VecDuplicate(right, of_scalar.out()));
+    PetscCall(VecCopy(right, kept));
+    PetscCall(VecCopy(by_scalar, of_scalar));
+    PetscCall(VecScale(of_scalar, -1));
+    PetscCall(solve(kept, now));
+    PetscCall(solve(of_scalar, border));
+    PetscCall(volume_of(now, V_fixed));
+    PetscCall(volume_of(border, V_border));
+    if (free)
+      scalar = slope * target - slope * V[static_cast<std::size_t>(r.past[0])];
+    else
+      scalar = solved ? (target - V_fixed) / V_border : target;
+    PetscCall(VecAXPY(now, scalar, border));
+    V[n] = V_fixed + scalar * V_border;
+    // the rows of a held airway: the flux
+    PetscReal flux = scalar;
+    if (!free) {
+      PetscCall(MatMult(A, now, other));
+      PetscCall(VecAXPY(other, -1, right));
+      PetscCall(VecAXPY(other, scalar, by_scalar));
+      PetscCall(VecZeroEntries(direction));
+      PetscCall(VecZeroEntries(F));
+      PetscCall(model_.airway().set(F, 1));
+      PetscCall(VecDot(F, other, &flux));
+      flux /= model_.row_scale(pressure);
+      PetscCall(model_.airway().set(now, scalar));
+      P[n] = scalar;
+    } else {
+      PetscCall(VecZeroEntries(direction));
+      PetscCall(DMGlobalToLocal(dm, now, INSERT_VALUES, direction));
+      PetscCall(model_.airway().mean_pressure(direction, P[n]));
+    }
+    PetscCall(VecCopy(now, last));
+    PetscCall(KSPDestroy(&ksp));
+    const auto row = static_cast<std::size_t>(r.row);
+    volume[row] = V[n];
+    pressure_[row] = P[n];
+    flow[row] = flux;
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
 }
 
 class Adjoint : public testing::TestWithParam<Breath> {
@@ -114,22 +279,106 @@ TEST_P(Adjoint, IsTheDerivativeOfTheRun)
   }
 }
 
-INSTANTIATE_TEST_SUITE_P(
-    Breaths, Adjoint,
-    testing::Values(Breath{"pressure_control", GAS PCV},
-                    Breath{"flow_by_area", GAS VCV "-ventilator_flow_split uniform"},
-                    Breath{"common_pressure", GAS VCV "-ventilator_flow_split common_pressure"},
-                    Breath{"tube", GAS PCV "-tube -tube_k1 4 -tube_k2 6e3 -ventilator_peep 1"},
-                    Breath{"volume_control_through_a_tube", GAS VCV "-tube -tube_k1 4 -tube_k2 6e3"},
-                    Breath{"pressure_control_without_airflow", "-airflow off " PCV},
-                    Breath{"volume_control_without_airflow", "-airflow off " VCV "-ventilator_tidal_volume 3e-5"},
-                    Breath{"two_breaths_with_peep", GAS VCV "-ventilator_peep 2 -ventilator_breaths 2"},
-                    Breath{"bdf", GAS PCV "-ts_type bdf"}, Breath{"bdf_volume_control", GAS VCV "-ts_type bdf"},
-                    Breath{"jump", GAS PCV "-ventilator_ramp 0 -ts_dt 0.05 -ventilator_pip 2"},
-                    Breath{"cut_steps", GAS PCV "-airflow_permeability 10 -snes_max_it 5", 1e-5, true},
-                    Breath{"cut_steps_of_bdf", GAS PCV "-airflow_permeability 10 -snes_max_it 5 -ts_type bdf", 1e-5,
-                           true}),
-    [](const auto &one) { return std::string(one.param.name); });
+class AdjointIdentity : public Adjoint {};
+
+TEST_P(AdjointIdentity, SweepAndTangentAgree)
+{
+  const Registry registry = Registry::standard();
+  SceneRun run(registry);
+  Trajectory trajectory(std::size_t(1) << 30, testing::TempDir());
+  bool finished = false;
+  std::string failure;
+  PULMO_OK(
+      set_options("-options_file " + source("petsc_options/solvers/tight.opts") + " " + base() + GetParam().options));
+  PULMO_OK(run.declare());
+  PULMO_OK(run.setup());
+  run.simulation().record(trajectory);
+  PULMO_OK(run.simulation().run(finished));
+  ASSERT_TRUE(finished);
+  const auto &rows = run.simulation().rows();
+  std::vector<Functional> list;
+  for (const std::string &name : functional_names())
+    if (const auto f = functional(name, rows)) list.push_back(*f);
+  ASSERT_GE(list.size(), 6u);
+  Model &model = run.model();
+  int found = 0;
+  for (const Options::RealOption &option : run.options().real_options()) {
+    const char *owner;
+    const PetscInt constant = model.composition().constant_at(option.target, &owner);
+    if (constant < 0 || *option.target == 0) continue;
+    SCOPED_TRACE(option.option);
+    ++found;
+    const PetscReal change = 1e-3 * std::abs(*option.target); // the same quotient on both sides, however good
+    std::vector<PetscReal> swept(list.size(), 0), volume, pressure, flow;
+    VecHandle at, moved;
+    PULMO_OK(DMCreateLocalVector(model.dm(), at.out()));
+    PULMO_OK(DMCreateLocalVector(model.dm(), moved.out()));
+    const auto visit = [&](const Sweep::Solved &stage) -> PetscErrorCode {
+      const StageRecord &r = stage.record;
+      PetscFunctionBeginUser;
+      PetscCall(model.residual(r.time, stage.state, stage.rate, at));
+      model.change_parameter(constant, change);
+      PetscCall(model.set_step(r.stage, r.airway.pressure, r.airway.flow));
+      PetscCall(model.residual(r.time, stage.state, stage.rate, moved));
+      model.change_parameter(constant, 0);
+      PetscCall(VecAXPY(moved, -1, at));
+      for (std::size_t k = 0; k < list.size(); ++k) {
+        PetscReal sum;
+        PetscCall(VecDot(moved, stage.adjoint[k], &sum));
+        swept[k] += sum / change;
+      }
+      PetscFunctionReturn(PETSC_SUCCESS);
+    };
+    Sweep sweep(run.scene(), model, run.simulation(), trajectory);
+    PULMO_OK(sweep.run(list, 1e-14, visit, failure));
+    ASSERT_EQ(failure, "");
+    PULMO_OK(MPI_Allreduce(MPI_IN_PLACE, swept.data(), static_cast<int>(swept.size()), MPIU_REAL, MPI_SUM,
+                           PETSC_COMM_WORLD));
+    Tangent tangent(run, trajectory, constant, change);
+    PULMO_OK(tangent.run(volume, pressure, flow));
+    for (std::size_t k = 0; k < list.size(); ++k) {
+      double forward = 0, size = 0;
+      for (std::size_t i = 0; i < rows.size(); ++i)
+        for (const double part : {list[k].by_volume[i] * volume[i] / units::mm3_per_ml,
+                                  list[k].by_pressure[i] * pressure[i] / units::kPa_per_cmH2O,
+                                  list[k].by_flow[i] * flow[i] / units::mm3_per_ml}) {
+          forward += part;
+          size += std::abs(part);
+        }
+      EXPECT_NEAR(swept[k], forward, 1e-10 * size + 1e-12 * std::abs(list[k].value / *option.target)) << list[k].name;
+    }
+  }
+  EXPECT_GE(found, 4);
+}
+
+std::vector<Breath> breaths(bool forward)
+{
+  std::vector<Breath> list = {
+      Breath{"pressure_control", GAS PCV, 1e-3, false, true},
+      Breath{"flow_by_area", GAS VCV "-ventilator_flow_split uniform", 1e-3, false, true},
+      Breath{"common_pressure", GAS VCV "-ventilator_flow_split common_pressure", 1e-3, false, true},
+      Breath{"tube", GAS PCV "-tube -tube_k1 4 -tube_k2 6e3 -ventilator_peep 1"},
+      Breath{"volume_control_through_a_tube", GAS VCV "-tube -tube_k1 4 -tube_k2 6e3"},
+      Breath{"pressure_control_without_airflow", "-airflow off " PCV},
+      Breath{"volume_control_without_airflow", "-airflow off " VCV "-ventilator_tidal_volume 3e-5"},
+      Breath{"two_breaths_with_peep", GAS VCV "-ventilator_peep 2 -ventilator_breaths 2", 1e-3, false, true},
+      Breath{"bdf", GAS PCV "-ts_type bdf"},
+      Breath{"bdf_volume_control", GAS VCV "-ts_type bdf"},
+      Breath{"jump", GAS PCV "-ventilator_ramp 0 -ts_dt 0.05 -ventilator_pip 2"},
+      Breath{"cut_steps", GAS PCV "-airflow_permeability 10 -snes_max_it 5", 1e-5, true, true},
+      Breath{"cut_steps_of_bdf", GAS PCV "-airflow_permeability 10 -snes_max_it 5 -ts_type bdf", 1e-5, true}};
+  if (forward)
+    list.erase(std::remove_if(list.begin(), list.end(), [](const Breath &b) { return !b.forward; }), list.end());
+  return list;
+}
+
+std::string name_of(const testing::TestParamInfo<Breath> &one)
+{
+  return one.param.name;
+}
+
+INSTANTIATE_TEST_SUITE_P(Breaths, Adjoint, testing::ValuesIn(breaths(false)), name_of);
+INSTANTIATE_TEST_SUITE_P(Breaths, AdjointIdentity, testing::ValuesIn(breaths(true)), name_of);
 
 } // namespace
 } // namespace pulmo::test
