@@ -1,6 +1,7 @@
 #include "pulmo/adjoint/sensitivities.hpp"
 
 #include "pulmo/input/errors.hpp"
+#include "pulmo/mesh/mesh.hpp"
 #include "pulmo/physics/parameter_fields.hpp"
 
 #include <algorithm>
@@ -19,6 +20,7 @@ struct Parameter {
   Options::RealOption option;
   PetscInt constant = -1;        ///< its place among those of kernels (Composition::constant_at)
   bool on_facets = false;        ///< nothing in the volume reads it
+  bool varies = false;           ///< it differs from place to place
   std::vector<Phase> less, more; ///< the ventilator's phases with less and more of it
   PetscReal change() const { return difference * std::abs(*option.target); }
 };
@@ -75,7 +77,8 @@ std::vector<Parameter> parameters_of(const Options &options, const Scene &scene,
     Parameter p;
     p.option = option;
     p.constant = composition.constant_at(option.target, &owner);
-    if (*option.target == 0 || std::find(varying.begin(), varying.end(), p.constant) != varying.end()) continue;
+    p.varies = std::find(varying.begin(), varying.end(), p.constant) != varying.end();
+    if (*option.target == 0 || (composition.varying() && p.constant >= 0 && !composition.derived().empty())) continue;
     if (p.constant < 0) {
       p.less = phases_with(facts, option, -p.change());
       p.more = phases_with(facts, option, p.change());
@@ -86,6 +89,16 @@ std::vector<Parameter> parameters_of(const Options &options, const Scene &scene,
     list.push_back(std::move(p));
   }
   return list;
+}
+
+using ByCell = std::vector<std::vector<PetscReal>>; ///< [number][cell of this rank]
+
+PetscErrorCode sum_up(MPI_Comm comm, std::vector<double> &values)
+{
+  PetscFunctionBeginUser;
+  PetscCallMPI(
+      MPI_Allreduce(MPI_IN_PLACE, values.data(), static_cast<PetscMPIInt>(values.size()), MPI_DOUBLE, MPI_SUM, comm));
+  PetscFunctionReturn(PETSC_SUCCESS);
 }
 
 } // namespace
@@ -142,7 +155,8 @@ PetscErrorCode Sensitivities::make(const Options &options, const Scene &scene, M
   const std::vector<Parameter> parameters = parameters_of(options, scene, model.composition());
   Sweep sweep(scene, model, simulation, *trajectory_);
   std::vector<Functional> functionals;
-  VecHandle all, on_facets, moved; // residuals
+  std::vector<Mesh::Region> regions;
+  ByCell all, on_facets, moved; // residuals times multipliers
   PetscLogDouble begin, end;
   PetscMPIInt rank;
 
@@ -159,17 +173,20 @@ PetscErrorCode Sensitivities::make(const Options &options, const Scene &scene, M
     report.numbers.push_back({f->key, f->name, f->unit, f->value});
   }
   for (const Parameter &p : parameters)
-    report.parameters.push_back(
-        {p.option.option, p.option.unit, *p.option.target, std::vector<double>(report.numbers.size(), 0)});
-  for (VecHandle *F : {&all, &on_facets, &moved}) PetscCall(DMCreateLocalVector(model.dm(), F->out()));
-  const auto residual = [&](const Sweep::Solved &stage, bool facets, Vec F) -> PetscErrorCode {
+    report.parameters.push_back({p.option.option,
+                                 p.option.unit,
+                                 *p.option.target,
+                                 p.varies,
+                                 std::vector<double>(report.numbers.size(), 0),
+                                 {}});
+  const std::size_t count = functionals.size();
+  std::vector<ByCell> by_cell(
+      parameters.size(), ByCell(count, std::vector<PetscReal>(static_cast<std::size_t>(model.assembly().cells()), 0)));
+  const auto residual = [&](const Sweep::Solved &stage, bool facets, ByCell &sums) -> PetscErrorCode {
     const StageRecord &record = stage.record;
     PetscFunctionBeginUser;
     PetscCall(model.set_step(record.stage, record.airway.pressure, record.airway.flow));
-    if (facets)
-      PetscCall(model.facet_residual(record.time, stage.state, stage.rate, F));
-    else
-      PetscCall(model.residual(record.time, stage.state, stage.rate, F));
+    PetscCall(model.weighted_residual(facets, record.time, stage.state, stage.rate, stage.adjoint, sums));
     PetscFunctionReturn(PETSC_SUCCESS);
   };
   const auto visit = [&](const Sweep::Solved &stage) -> PetscErrorCode {
@@ -179,30 +196,38 @@ PetscErrorCode Sensitivities::make(const Options &options, const Scene &scene, M
     PetscCall(residual(stage, true, on_facets));
     for (std::size_t i = 0; i < parameters.size(); ++i) {
       const Parameter &p = parameters[i];
-      std::vector<double> &derivative = report.parameters[i].derivative;
       const PetscReal change = p.change();
       if (p.constant < 0) {
         const PetscReal by_parameter = (target(record, p.more) - target(record, p.less)) / (2 * change);
-        for (std::size_t k = 0; k < derivative.size(); ++k)
-          derivative[k] += rank == 0 ? stage.by_target[k] * by_parameter : 0;
+        for (std::size_t k = 0; k < count; ++k)
+          report.parameters[i].derivative[k] += rank == 0 ? stage.by_target[k] * by_parameter : 0;
         continue;
       }
       model.change_parameter(p.constant, change);
       PetscCall(residual(stage, p.on_facets, moved));
       model.change_parameter(p.constant, 0);
-      PetscCall(VecAXPY(moved, -1, p.on_facets ? on_facets : all));
-      for (std::size_t k = 0; k < derivative.size(); ++k) {
-        PetscReal sum;
-        PetscCall(VecDot(moved, stage.adjoint[k], &sum));
-        derivative[k] += sum / change;
-      }
+      const ByCell &base = p.on_facets ? on_facets : all;
+      for (std::size_t k = 0; k < count; ++k)
+        for (std::size_t c = 0; c < moved[k].size(); ++c) by_cell[i][k][c] += (moved[k][c] - base[k][c]) / change;
     }
     PetscFunctionReturn(PETSC_SUCCESS);
   };
   if (!report.numbers.empty()) PetscCall(sweep.run(functionals, tolerance_, visit, report.failure));
-  for (SensitivityReport::Parameter &row : report.parameters)
-    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, row.derivative.data(), static_cast<PetscMPIInt>(row.derivative.size()),
-                               MPIU_REAL, MPI_SUM, options.comm()));
+  PetscCall(scene.mesh().regions(regions));
+  for (std::size_t i = 0; i < parameters.size(); ++i) {
+    SensitivityReport::Parameter &row = report.parameters[i];
+    for (std::size_t k = 0; k < count; ++k)
+      for (const PetscReal part : by_cell[i][k]) row.derivative[k] += part;
+    PetscCall(sum_up(options.comm(), row.derivative));
+    for (const Mesh::Region &region : regions) {
+      if (parameters[i].constant < 0) break;
+      std::vector<double> sums(count, 0);
+      for (std::size_t k = 0; k < count; ++k)
+        for (const PetscInt c : region.cells) sums[k] += by_cell[i][k][static_cast<std::size_t>(c)];
+      PetscCall(sum_up(options.comm(), sums));
+      row.by_region.emplace_back(region.name, sums);
+    }
+  }
   PetscCall(PetscTime(&end));
   report.seconds = end - begin;
   report.solves = static_cast<int>(sweep.solves());

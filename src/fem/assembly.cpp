@@ -6,6 +6,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <memory>
 #include <numeric>
 
 namespace pulmo {
@@ -324,10 +325,10 @@ PetscErrorCode Assembly::put_places(const std::vector<PetscReal> &rows, const st
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Assembly::residual(Part part, PetscReal t, Vec x, Vec x_t, const PetscReal row_scale[], Vec F)
+template <class Scatter>
+PetscErrorCode Assembly::for_vectors(Part part, PetscReal t, Vec x, Vec x_t, Scatter &&scatter)
 {
   PetscFunctionBeginUser;
-  WriteArray f(F);
   const auto on_cells = [&](PetscInt n, PetscFEGeom *geom, const PetscScalar *u, const PetscScalar *u_t,
                             PetscScalar *vectors) -> PetscErrorCode {
     PetscFunctionBeginUser;
@@ -341,13 +342,48 @@ PetscErrorCode Assembly::residual(Part part, PetscReal t, Vec x, Vec x_t, const 
     PetscCall(PetscFEIntegrateBdResidual(ds_, facets.wf, facets.key, n, geom, u, u_t, rate_ds_, u_t, t, vectors));
     PetscFunctionReturn(PETSC_SUCCESS);
   };
+  PetscCall(for_blocks(part, x, x_t, layout_.size, on_cells, on_facets, scatter));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Assembly::residual(Part part, PetscReal t, Vec x, Vec x_t, const PetscReal row_scale[], Vec F)
+{
+  PetscFunctionBeginUser;
+  WriteArray f(F);
   const auto scatter = [&](PetscInt cell, const PetscScalar *vector) -> PetscErrorCode {
     const PetscInt *dofs = cell_dofs(cell);
     for (PetscInt i = 0; i < layout_.size; ++i) f[dofs[i]] += row_scale[layout_.field_of[i]] * vector[i];
     return PETSC_SUCCESS;
   };
-  PetscCall(for_blocks(part, x, x_t, layout_.size, on_cells, on_facets, scatter));
+  PetscCall(for_vectors(part, t, x, x_t, scatter));
   PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Assembly::weighted_residual(Part part, PetscReal t, Vec x, Vec x_t, const PetscReal row_scale[],
+                                           const std::vector<Vec> &weights, std::vector<std::vector<PetscReal>> &sums)
+{
+  std::vector<std::unique_ptr<ReadArray>> arrays;
+
+  PetscFunctionBeginUser;
+  for (const Vec weight : weights) arrays.push_back(std::make_unique<ReadArray>(weight));
+  sums.assign(weights.size(), std::vector<PetscReal>(static_cast<std::size_t>(layout_.cells), 0));
+  const auto scatter = [&](PetscInt cell, const PetscScalar *vector) -> PetscErrorCode {
+    const PetscInt *dofs = cell_dofs(cell);
+    for (std::size_t k = 0; k < weights.size(); ++k)
+      for (PetscInt i = 0; i < layout_.size; ++i)
+        sums[k][static_cast<std::size_t>(cell)] += row_scale[layout_.field_of[i]] * vector[i] * (*arrays[k])[dofs[i]];
+    return PETSC_SUCCESS;
+  };
+  PetscCall(for_vectors(part, t, x, x_t, scatter));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+void Assembly::change_varying(std::size_t which, PetscReal change)
+{
+  const std::size_t n = places_.offsets.size();
+  for (std::size_t i = which; i < cell_constants_.size(); i += n) cell_constants_[i] += change;
+  for (Facets *facets : facets_)
+    for (std::size_t i = which; i < facets->constants.size(); i += n) facets->constants[i] += change;
 }
 
 template <class Scatter>

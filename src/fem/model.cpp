@@ -504,12 +504,17 @@ PetscErrorCode Model::residual(PetscReal t, Vec x, Vec x_t, Vec F)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Model::facet_residual(PetscReal t, Vec x, Vec x_t, Vec F)
+void Model::change_parameter(PetscInt constant, PetscReal change)
 {
-  PetscFunctionBeginUser;
-  PetscCall(VecZeroEntries(F));
-  PetscCall(assembly_.residual(Assembly::Part::facets, t, x, x_t, row_scale_.data(), F));
-  PetscFunctionReturn(PETSC_SUCCESS);
+  const ParameterFields *varying = composition().varying();
+  if (varying) {
+    const auto &offsets = varying->offsets();
+    const auto found = std::find(offsets.begin(), offsets.end(), constant);
+    if (found != offsets.end()) {
+      assembly_.change_varying(static_cast<std::size_t>(found - offsets.begin()), change - change_.by);
+    }
+  }
+  change_ = {constant, change};
 }
 
 /// PETSc's own loop over cells, then the scaling of the rows.

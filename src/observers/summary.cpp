@@ -191,11 +191,13 @@ Json sensitivities_json(const SensitivityReport &report)
   Json json = {{"numbers", Json::object()}};
   for (std::size_t k = 0; k < report.numbers.size() && report.failure.empty(); ++k) {
     Json parameters = Json::object();
-    for (const SensitivityReport::Parameter &p : report.parameters)
-      parameters[p.option] = {{"value", p.value},
-                              {"unit", p.unit},
-                              {"derivative", p.derivative[k]},
-                              {"percent_for_one_percent_more", report.percent(p, k)}};
+    for (const SensitivityReport::Parameter &p : report.parameters) {
+      Json &entry = parameters[p.option];
+      entry = {{"value", p.value}, {"unit", p.unit}, {"derivative", p.derivative[k]}};
+      // of one value in many one percent says nothing
+      entry["percent_for_one_percent_more"] = p.varies ? Json(nullptr) : Json(report.percent(p, k));
+      for (const auto &[region, derivative] : p.by_region) entry["regions"][region] = derivative[k];
+    }
     json["numbers"][report.numbers[k].key] = {{"value", report.numbers[k].value}, {"parameters", parameters}};
   }
   json["not_defined"] = report.undefined;

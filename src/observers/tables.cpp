@@ -202,6 +202,10 @@ PetscErrorCode print_sensitivities(MPI_Comm comm, const SensitivityReport &repor
   PetscCall(PetscPrintf(comm, "\n%-36s %12s", "1 % more of it changes, by %", ""));
   for (const SensitivityReport::Number &n : report.numbers) PetscCall(PetscPrintf(comm, " %8s", n.name.c_str()));
   for (const SensitivityReport::Parameter &p : report.parameters) {
+    if (p.varies) {
+      PetscCall(PetscPrintf(comm, "\n  %-34s differs from place to place: see summary.json", p.option.c_str()));
+      continue;
+    }
     PetscCall(PetscPrintf(comm, "\n  %-34s %12.5g", p.option.c_str(), p.value));
     for (std::size_t k = 0; k < report.numbers.size(); ++k)
       PetscCall(PetscPrintf(comm, " %8.3f", report.percent(p, k)));

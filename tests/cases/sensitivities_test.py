@@ -53,6 +53,22 @@ class Sensitivities(unittest.TestCase):
                              SCENE[len(pc.BLOCK + pc.QUIET + pc.PAPER + pc.DIRECT):] + ASK)
         self.same(run, krylov, 1e-6)
 
+    def test_regions(self):
+        """A value that changes in one lung alone, where all is alike and where the lungs differ; against runs that differ so."""
+        scene = (pc.DIRECT + pc.options_file("scenes/pcv.opts") + pc.QUIET +
+                 ["-dm_plex_filename", pc.mesh("lung_pair.msh"), "-elements", "P1-P1", "-ts_dt", "0.2", "-ventilator_inspiration", "0.4",
+                  "-ventilator_expiration", "0.4", "-ventilator_ramp", "0.2", "-ventilator_ramp_down", "0.2", "-energy_audit", "off"])
+        for given in (0.35, 0.5):
+            with self.subTest(right_lung=given):
+                run = pc.finished(scene + ["-tissue_c", f"0.35,right_lung={given}" if given != 0.35 else "0.35"] + ASK, ranks=2)
+                one = run.json()["sensitivities"]["numbers"]["compliance_ml_per_cmH2O"]["parameters"]["-tissue_c"]
+                self.assertEqual(one["percent_for_one_percent_more"] is None, given != 0.35)
+                self.assertAlmostEqual(sum(one["regions"].values()), one["derivative"], delta=1e-9 * abs(one["derivative"]))
+                moved = [pc.finished(scene + ["-tissue_c", f"0.35,right_lung={given + s}"]).json()["compliance_ml_per_cmH2O"]
+                         for s in (-1e-3, 1e-3)]
+                self.assertAlmostEqual((moved[1] - moved[0]) / 2e-3, one["regions"]["right_lung"], delta=1e-5 * abs(one["derivative"]))
+                self.assertLess(one["regions"]["right_lung"], -1)
+
     def test_what_is_not_asked_for_is_not_there(self):
         case = pc.finished(SCENE)
         self.assertNotIn("sensitivities", case.json())

@@ -68,6 +68,12 @@ public:
 
   /// Adds the residual of the local vectors @p x and @p x_t to F; rows of field f are multiplied by row_scale[f].
   PetscErrorCode residual(Part part, PetscReal t, Vec x, Vec x_t, const PetscReal row_scale[], Vec F);
+  /// The same residual times each of the local vectors @p weights, cell by cell; a facet counts to the cell behind it.
+  /// @p sums: [weight][cell of this rank].
+  PetscErrorCode weighted_residual(Part part, PetscReal t, Vec x, Vec x_t, const PetscReal row_scale[],
+                                   const std::vector<Vec> &weights, std::vector<std::vector<PetscReal>> &sums);
+  /// Adds @p change to a constant that differs from place to place (ParameterFields::offsets()), wherever it is.
+  void change_varying(std::size_t which, PetscReal change);
   /// A = dF/dx + shift dF/dx_t, rows scaled alike; Part::facets adds to A.
   /// With @p also the element matrices of the cells go there too. Collective.
   PetscErrorCode jacobian(Part part, PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[], Mat A,
@@ -108,6 +114,9 @@ private:
   template <class OnCells, class OnFacets, class Scatter>
   PetscErrorCode for_blocks(Part part, Vec x, Vec x_t, PetscInt result_size, OnCells &&on_cells, OnFacets &&on_facets,
                             Scatter &&scatter);
+  /// The same for the vectors of the residual.
+  template <class Scatter>
+  PetscErrorCode for_vectors(Part part, PetscReal t, Vec x, Vec x_t, Scatter &&scatter);
   /// The same for the matrices of dF/dx + shift dF/dx_t.
   template <class Scatter>
   PetscErrorCode for_matrices(Part part, PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[],

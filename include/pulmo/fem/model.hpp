@@ -49,8 +49,14 @@ public:
   /// Local residual, rows scaled. @p x and @p x_t are local vectors with constrained values in place. Rows of held
   /// nodes hold the flux that enters there.
   PetscErrorCode residual(PetscReal t, Vec x, Vec x_t, Vec F);
-  /// The share of the facets in it.
-  PetscErrorCode facet_residual(PetscReal t, Vec x, Vec x_t, Vec F);
+  /// That residual, or the share of the facets in it, times each of the local vectors @p weights, cell by cell
+  /// (Assembly::weighted_residual).
+  PetscErrorCode weighted_residual(bool facets, PetscReal t, Vec x, Vec x_t, const std::vector<Vec> &weights,
+                                   std::vector<std::vector<PetscReal>> &sums)
+  {
+    return assembly_.weighted_residual(facets ? Assembly::Part::facets : Assembly::Part::all, t, x, x_t,
+                                       row_scale_.data(), weights, sums);
+  }
   /// Sums of a global residual over the nodes, by field and in its units: kPa mm^2; mm^3/s.
   struct ResidualSums {
     std::vector<PetscReal> absolute, net;
@@ -99,9 +105,10 @@ public:
   /// What effects remember at the points; null if none does.
   PointMemory *memory() const { return memory_.get(); }
 
-  /// Adds @p change to what a kernel is told at place @p constant of its constants (Composition::constant_at) from the
-  /// next set_step() on, and to what follows from that; 0 ends it. Parameters that differ from place to place: none.
-  void change_parameter(PetscInt constant, PetscReal change) { change_ = {constant, change}; }
+  /// Adds @p change, everywhere, to what kernels are told at place @p constant of their constants
+  /// (Composition::constant_at), and to what follows from that; 0 ends it. Where parameters differ from place to place
+  /// nothing may follow from them. It ends set_step().
+  void change_parameter(PetscInt constant, PetscReal change);
 
   PetscReal row_scale(PetscInt field) const { return row_scale_[field]; }
   PetscReal modulus() const { return modulus_; } ///< tissue stiffness that scales the equations, kPa

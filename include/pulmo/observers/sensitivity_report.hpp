@@ -3,6 +3,7 @@
 #pragma once
 
 #include <string>
+#include <utility>
 #include <vector>
 
 namespace pulmo {
@@ -17,8 +18,10 @@ struct SensitivityReport {
   /// A parameter, and the derivatives of the numbers by it.
   struct Parameter {
     std::string option, unit;
-    double value = 0;
-    std::vector<double> derivative; ///< [number], in its unit per that of the parameter
+    double value = 0;               ///< where parts of the lung have values of their own: that of all others
+    bool varies = false;            ///< parts of the lung have values of their own
+    std::vector<double> derivative; ///< [number], in its unit per that of the parameter, if it changes alike everywhere
+    std::vector<std::pair<std::string, std::vector<double>>> by_region; ///< the same if it changes in that region alone
   };
 
   std::vector<Number> numbers;
@@ -29,9 +32,10 @@ struct SensitivityReport {
   int solves = 0, krylov = 0;
 
   /// By how many percent number @p k changes where parameter @p p grows by one.
-  double percent(const Parameter &p, std::size_t k) const
+  double percent(const Parameter &p, std::size_t k) const { return percent(p.derivative[k], p, k); }
+  double percent(double derivative, const Parameter &p, std::size_t k) const
   {
-    return numbers[k].value != 0 ? p.derivative[k] * p.value / numbers[k].value : 0;
+    return numbers[k].value != 0 ? derivative * p.value / numbers[k].value : 0;
   }
 };
 

@@ -19,6 +19,7 @@ def build(run):
     rows = []
     for option in options:
         of = [given["parameters"][option] for given in numbers.values()]
+        percent = [one["percent_for_one_percent_more"] for one in of]
         rows.append({"option": option, "value": number(of[0]["value"]), "unit": of[0]["unit"].replace("H2O", "H₂O"),
-                     "values": [f"{one['percent_for_one_percent_more']:+.2f}".replace("-", "−") for one in of]})
+                     "values": ["differs by place" if p is None else f"{p:+.2f}".replace("-", "−") for p in percent]})
     return {"heads": [ROWS[key][0] for key in numbers], "rows": rows, "seconds": number(told["seconds"], 3)}
