@@ -412,6 +412,8 @@ def table(m):
                                          ["-cavity_file", "run the same way", "orient"]),
         "a lung outside of its cavity": (good + ["-cavity", "-cavity_file", text_file("small.stl", stl(FACETS))],
                                          ["-cavity_file", "not within the cavity", "mm outside at rest", "-cavity_scale"]),
+        "a lung outside of a cavity with fluid": (good + ["-cavity", "-cavity_tension", "-cavity_file", text_file("wet.stl", stl(FACETS))],
+                                                  ["-cavity_file", "not within the cavity", "mm outside at rest", "-cavity_scale"]),
         "a negative gap": (good + ["-cavity", "-cavity_gap", "-1"], ["-cavity_gap", "-1"]),
         "a gap by cell": (good + ["-cavity"] + values("gap", np.ones(100), "-cavity_gap"), ["-cavity_gap", "parts of the mesh"]),
         "a gap beside a file": (good + ["-cavity", "-cavity_file", text_file("with_gap.stl", stl(FACETS)), "-cavity_gap", "1"],

@@ -122,6 +122,21 @@ class Column(unittest.TestCase):
         volumes = [pulmo.finished(COLUMN + wall + programme).signals()["volume_ml"][-1] for wall in (cube, own)]
         self.assertAlmostEqual(*volumes, delta=1e-9)
 
+    def test_a_wall_of_another_size_is_told(self):
+        for tension in ([], ["-cavity_tension"]):
+            run = pulmo.Case(COLUMN + flat_wall() + ["-cavity_scale", "50", "-scene_view_only"] + tension + pulmo.programme(UP_AND_DOWN))
+            self.assertEqual(run.code, 0, run.err)
+            self.assertRegex(run.out, "pulmo: warning: -cavity_file .* check -cavity_scale")
+
+    def test_fluid_takes_outlines_that_cross(self):
+        """By less than a spacing, but not by more."""
+        programme = pulmo.programme("up 0.1 pressure 1 ramp 0.1\n")
+        both = ["-cavity_tension", "-cavity_stiffness", 0.3, "-cavity_spacing", 4]
+        self.assertNotIn("warning", pulmo.finished(COLUMN + flat_wall(98) + both + programme).out)
+        run = pulmo.Case(COLUMN + flat_wall(94) + both + programme)
+        self.assertEqual(run.code, 1)
+        self.assertIn("the lung is not within the cavity", run.err)
+
     def test_a_soft_wall_is_told(self):
         run = pulmo.finished(COLUMN + flat_wall() + ["-cavity_stiffness", "0.05"] + pulmo.programme("up 0.4 pressure 24 ramp 0.4\n"))
         self.assertIn("the wall gives way", run.out)

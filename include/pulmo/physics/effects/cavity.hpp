@@ -206,14 +206,19 @@ private:
     return gap;
   }
 
-  PetscErrorCode build(const Options &options)
+  /// Of the grid, mm.
+  PetscReal spacing() const
   {
     constexpr PetscReal share = 1. / 128; // of the cavity's size
-    constexpr double coarsest = 1. / 16;  // of it
-    constexpr double share_lost = 0.05;   // of a spacing
-    constexpr int margin = 8;             // spacings beyond the wall, for states on the way to a solution
-    const PetscReal spacing = spacing_ > 0 ? spacing_ : share * surface_.size(),
-                    reach = largest_gap(options) + margin * spacing,
+    return spacing_ > 0 ? spacing_ : share * surface_.size();
+  }
+
+  PetscErrorCode build(const Options &options)
+  {
+    constexpr double coarsest = 1. / 16; // of the cavity's size
+    constexpr double share_lost = 0.05;  // of a spacing
+    constexpr int margin = 8;            // spacings beyond the wall, for states on the way to a solution
+    const PetscReal spacing = this->spacing(), reach = largest_gap(options) + margin * spacing,
                     nodes = SignedDistance::nodes(surface_, spacing, reach);
 
     PetscFunctionBeginUser;
@@ -236,7 +241,7 @@ private:
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
-  /// Refuses a lung that is not within the cavity at rest, and tells of a wall that it cannot reach.
+  /// Refuses a lung that is not within the cavity at rest, and tells of a wall that is no wall of its chest.
   PetscErrorCode check_inside(const Options &options, const Mesh &mesh) const
   {
     struct {
@@ -244,9 +249,14 @@ private:
       int rank;
     } own{PETSC_MAX_REAL, 0}, least{};
     double where[3] = {0, 0, 0};
-    const double size = std::cbrt(mesh.volume()), rounding = 1e-9 * size;
+    constexpr double far_larger = 10;
+    // fluid keeps the distance at rest, whatever it is: two outlines of one lung may cross by what a grid rounds off
+    const double size = std::cbrt(mesh.volume()), rounding = 1e-9 * size, outside = spacing();
+    PetscReal low[3], high[3];
 
     PetscFunctionBeginUser;
+    PetscCall(DMGetBoundingBox(mesh.dm(), low, high));
+    const double across = std::hypot(high[0] - low[0], high[1] - low[1], high[2] - low[2]);
     PetscCallMPI(MPI_Comm_rank(options.comm(), &own.rank));
     for (const std::string &surface : surfaces_)
       PetscCall(mesh.visit_surface(surface, [&](const PetscReal x[3]) {
@@ -258,7 +268,7 @@ private:
     PetscCallMPI(MPI_Allreduce(&own, &least, 1, MPI_DOUBLE_INT, MPI_MINLOC, options.comm()));
     PetscCallMPI(MPI_Bcast(where, 3, MPI_DOUBLE, least.rank, options.comm()));
     PulmoUserCheck(
-        least.distance >= -rounding || tension_, options.comm(),
+        least.distance >= -(tension_ ? outside : rounding), options.comm(),
         "-cavity_file %s: the lung is not within the cavity: near (%.4g, %.4g, %.4g) mm it is %.3g mm outside "
         "at rest; check the axes and -cavity_scale, enlarge the cavity, or lower -cavity_spacing (edges are "
         "rounded off over a spacing)",
@@ -268,6 +278,12 @@ private:
                             "pulmo: warning: -cavity_file %s: the wall is %.3g mm or more away from the lung, which is "
                             "not as large itself; check -cavity_scale\n",
                             file_.c_str(), least.distance));
+    else if (surface_.size() > far_larger * across)
+      PetscCall(
+          PetscPrintf(options.comm(),
+                      "pulmo: warning: -cavity_file %s: the cavity is %.3g mm across, and the lung %.3g mm; check "
+                      "-cavity_scale\n",
+                      file_.c_str(), surface_.size(), across));
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
