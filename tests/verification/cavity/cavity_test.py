@@ -241,6 +241,28 @@ class OwnShape(unittest.TestCase):
         self.assertLess(most, 0.1 * gap)
         self.assertLess(abs(run.json()["energy_j"]["residual_relative"]), 1e-6)
 
+    def test_each_part_is_held_to_its_own_gap(self):
+        """The lung is all right_lung: the first value of an option is nowhere."""
+        scene = (pulmo.LUNG + pulmo.PCV + pulmo.DIRECT + pulmo.QUIET + ["-elements", "P1-P1", "-tissue", "ma", "-ts_max_time", "0.5", "-cavity",
+                 "-snes_linesearch_type", "l2", "-cavity_stiffness", "0.5"])
+        one, *others = [pulmo.finished(scene + ["-cavity_gap", gap]) for gap in ("1", "100,right_lung=1", "0,right_lung=1", "0.01,right_lung=1")]
+        most = one.signals()["cavity_penetration_percent"].max()
+        self.assertGreater(most, 20)
+        self.assertAlmostEqual(most, 100 * one.json()["largest_cavity_penetration_mm"], delta=1e-9)
+        self.assertIn("the wall gives way", one.out)
+        for run in others:
+            self.assertIn("the wall gives way", run.out)
+            self.assertNotIn("the wall is not there", run.out)
+            self.assertAlmostEqual(run.json()["largest_cavity_penetration_percent"], most, delta=1e-6)
+        wide = pulmo.finished(scene + ["-cavity_gap", "0.01,right_lung=3"])
+        self.assertNotIn("the wall gives way", wide.out)
+
+    def test_folds_are_looked_for_where_the_gap_is(self):
+        for gap, told in (("100,right_lung=1", False), ("0,right_lung=100", True)):
+            run = pulmo.Case(pulmo.LUNG + pulmo.PCV + pulmo.DIRECT + ["-cavity", "-cavity_gap", gap, "-cavity_spacing", "4", "-scene_view_only"])
+            self.assertEqual(run.code, 0, run.err)
+            self.assertEqual("the wall is not there" in run.out, told)
+
     def test_without_a_gap_the_wall_is_the_surface(self):
         run = pulmo.finished(pulmo.LUNG + pulmo.PCV + pulmo.DIRECT + pulmo.QUIET + ["-elements", "P1-P1", "-tissue", "ma", "-ts_max_time", "0.2", "-cavity",
                              "-cavity_gap", "0", "-airflow", "off", "-chest_wall_surfaces", "airway", "-snes_linesearch_type", "l2"])

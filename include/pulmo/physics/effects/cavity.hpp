@@ -33,6 +33,7 @@ struct CavityKernels {
     PetscScalar from_rest = 1;  ///< 1: so it is; 0: the distance at rest is that of the file's surface
     PetscScalar tension = 0;    ///< 1: the wall holds the lung, too
     PetscScalar wall = 0;       ///< const SignedDistance *, as constants::to_scalar() packs it
+    PetscScalar no_gap = 0;     ///< what a penetration is held to where there is no gap, mm
   };
 
   struct Contact {
@@ -83,7 +84,8 @@ struct CavityKernels {
     return work - stored(now, before, k);
   }
 
-  /// Penetration, pressure per reference area, and area that touches per reference area.
+  /// Penetration, pressure per reference area, area that touches per reference area, and penetration over the gap
+  /// there.
   static void remember(const Point &point, const Parameters &k, PetscScalar value[])
   {
     const Contact c = contact(distance(point, k).distance, point, k);
@@ -93,6 +95,7 @@ struct CavityKernels {
     value[0] = touches ? c.q : 0;
     value[1] = c.p;
     value[2] = touches ? std::hypot(area[0], area[1], area[2]) : 0;
+    value[3] = value[0] / (k.from_rest != 0 && k.gap > 0 ? k.gap : k.no_gap);
   }
 };
 
@@ -147,10 +150,11 @@ public:
       PulmoUserCheck(v.target != &parameters_.gap || !v.by_cell, options.comm(),
                      "-cavity_gap takes no values by cell: the wall is a surface; name parts of the mesh instead "
                      "(-cavity_gap 5,left_lung=8)");
+    PetscCall(find_facets(options, mesh));
     PetscCall(build(options));
     if (!file_.empty())
       PetscCall(check_inside(options, mesh));
-    else if (!tension_ && parameters_.gap > 0)
+    else if (largest_gap_ > 0)
       PetscCall(check_folds(options, mesh));
     PetscFunctionReturn(PETSC_SUCCESS);
   }
@@ -164,6 +168,7 @@ public:
     parameters_.from_rest = file_.empty() || tension_ ? 1 : 0;
     if (tension_) parameters_.gap = 0;
     parameters_.tension = tension_ ? 1 : 0;
+    parameters_.no_gap = no_gap * std::cbrt(c.mesh().volume());
     parameters_.wall = constants::to_scalar(static_cast<const SignedDistance *>(&wall_));
     c.parameters(parameters_);
     for (const std::string &surface : surfaces_) {
@@ -172,7 +177,7 @@ public:
                          g0(surface_jacobian<P, K::push_by_displacement>));
       c.energy(Energy::stored, "elastic_cavity", surface, energy_density<P, K::stored>);
       c.energy(Energy::numerical, "numerical_dissipation", surface, energy_density<P, K::numerical>);
-      c.remember({{"cavity_penetration", "mm"}, {"cavity_push", "kPa"}, {"cavity_touch", "1"}},
+      c.remember({{"cavity_penetration", "mm"}, {"cavity_push", "kPa"}, {"cavity_touch", "1"}, {"cavity_give", "1"}},
                  remembered<P, K::remember>, surface);
     }
     const std::size_t penetration = c.sum_up(0, Over::largest_of_facets, 1), push = c.sum_up(1, Over::facets, 1),
@@ -183,27 +188,66 @@ public:
       return area > 0 ? row.integrals[push] / area / units::kPa_per_cmH2O : 0;
     });
     c.signal("cavity_penetration_mm", [=](const SignalRow &row) { return row.integrals[penetration]; });
-    const bool by_gap = parameters_.from_rest != 0 && parameters_.gap > 0;
-    const PetscReal share = by_gap ? 0.1 : 0.01, size = by_gap ? parameters_.gap : std::cbrt(c.mesh().volume());
+    c.limit(PETSC_MAX_REAL, "");
+    if (tension_) PetscFunctionReturn(PETSC_SUCCESS); // the lung may move as the fluid gives way
+    constexpr PetscReal percent = 100, most = 10;
+    const std::size_t give = c.sum_up(3, Over::largest_of_facets, percent);
+    c.signal("cavity_penetration_percent", [=](const SignalRow &row) { return row.integrals[give]; });
     char told[200];
-    PetscCall(PetscSNPrintf(told, sizeof(told),
-                            "that is more than %g %% of the %s (%.3g mm), the wall gives way; give a larger "
-                            "-cavity_stiffness",
-                            (double)(100 * share), by_gap ? "gap" : "lung's size", (double)size));
-    c.limit(tension_ ? PETSC_MAX_REAL : share * size, told);
+    PetscCall(
+        PetscSNPrintf(told, sizeof(told),
+                      "a penetration of more than %g %% of the gap there, or without a gap of %g %% of the lung's "
+                      "size, says that the wall gives way; give a larger -cavity_stiffness",
+                      (double)most, (double)(most * no_gap)));
+    c.limit(most, told);
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
 private:
   static constexpr PetscReal mm2_per_cm2 = 100;
-  /// The largest gap of all parts of the lung, mm.
-  PetscReal largest_gap(const Options &options) const
+  static constexpr PetscReal no_gap = 0.1; ///< of the lung's size: what counts as the gap where there is none
+
+  struct Facet {
+    PetscInt point; ///< of the mesh
+    PetscReal gap;  ///< mm
+  };
+  /// Those that touch the wall, of this rank, and the largest of all gaps. A gap by surface comes before one by region.
+  /// Collective.
+  PetscErrorCode find_facets(const Options &options, const Mesh &mesh)
   {
-    PetscReal gap = file_.empty() && !tension_ ? parameters_.gap : 0;
-    for (const Options::Varying &v : options.varying())
-      if (v.target == &parameters_.gap)
-        for (const auto &[part, value] : v.by_name) gap = std::max(gap, value);
-    return gap;
+    const bool gaps = file_.empty() && !tension_;
+    std::vector<Mesh::Region> regions;
+    std::vector<PetscInt> facets;
+    std::vector<PetscReal> of_cell;
+    PetscInt begin, end;
+
+    PetscFunctionBeginUser;
+    PetscCall(DMPlexGetHeightStratum(mesh.dm(), 0, &begin, &end));
+    of_cell.assign(static_cast<std::size_t>(end - begin), gaps ? parameters_.gap : 0);
+    const auto varying = std::find_if(options.varying().begin(), options.varying().end(),
+                                      [&](const Options::Varying &v) { return v.target == &parameters_.gap; });
+    const bool varies = gaps && varying != options.varying().end();
+    if (varies) PetscCall(mesh.regions(regions));
+    for (const Mesh::Region &region : regions)
+      for (const auto &[part, value] : varying->by_name)
+        if (part == region.name)
+          for (const PetscInt c : region.cells) of_cell[static_cast<std::size_t>(c)] = value;
+    facets_.clear();
+    largest_gap_ = 0;
+    for (const std::string &surface : surfaces_) {
+      PetscCall(mesh.facets(surface, facets));
+      for (const PetscInt facet : facets) {
+        const PetscInt *cell;
+        PetscCall(DMPlexGetSupport(mesh.dm(), facet, &cell));
+        facets_.push_back({facet, of_cell[static_cast<std::size_t>(cell[0] - begin)]});
+        if (varies)
+          for (const auto &[part, value] : varying->by_name)
+            if (part == surface) facets_.back().gap = value;
+        largest_gap_ = std::max(largest_gap_, facets_.back().gap);
+      }
+    }
+    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &largest_gap_, 1, MPIU_REAL, MPI_MAX, options.comm()));
+    PetscFunctionReturn(PETSC_SUCCESS);
   }
 
   /// Of the grid, mm.
@@ -218,7 +262,7 @@ private:
     constexpr double coarsest = 1. / 16; // of the cavity's size
     constexpr double share_lost = 0.05;  // of a spacing
     constexpr int margin = 8;            // spacings beyond the wall, for states on the way to a solution
-    const PetscReal spacing = this->spacing(), reach = largest_gap(options) + margin * spacing,
+    const PetscReal spacing = this->spacing(), reach = largest_gap_ + margin * spacing,
                     nodes = SignedDistance::nodes(surface_, spacing, reach);
 
     PetscFunctionBeginUser;
@@ -230,7 +274,7 @@ private:
         nodes <= SignedDistance::most_nodes, options.comm(),
         "-cavity: a grid of %.3g mm around a cavity of %.3g mm and a gap of %.3g mm has %.2g nodes, more than "
         "%.2g; give a larger -cavity_spacing, or a smaller -cavity_gap",
-        (double)spacing, surface_.size(), (double)largest_gap(options), (double)nodes, SignedDistance::most_nodes);
+        (double)spacing, surface_.size(), (double)largest_gap_, (double)nodes, SignedDistance::most_nodes);
     wall_.build(surface_, spacing, reach);
     const double departure = wall_.departure(surface_);
     if (departure > share_lost * spacing)
@@ -291,30 +335,29 @@ private:
   PetscErrorCode check_folds(const Options &options, const Mesh &mesh) const
   {
     constexpr double there = 0.75, told = 0.05; // of the gap; of the area
-    double area[2] = {0, 0};                    // of all, of what folds, mm^2
+    double area[2] = {0, 0}, gap = 0;           // of all, of what folds, mm^2; the largest there, mm
 
     PetscFunctionBeginUser;
-    for (const std::string &surface : surfaces_) {
-      std::vector<PetscInt> facets;
-      PetscCall(mesh.facets(surface, facets));
-      for (const PetscInt facet : facets) {
-        PetscReal measure, middle[3], moved[3], normal[3];
-        PetscCall(DMPlexComputeCellGeometryFVM(mesh.dm(), facet, &measure, middle, normal));
-        const SignedDistance::Value s = wall_.at(middle);
-        const double inward = s.gradient[0] * normal[0] + s.gradient[1] * normal[1] + s.gradient[2] * normal[2];
-        for (int d = 0; d < 3; ++d) moved[d] = middle[d] - std::copysign(parameters_.gap, inward) * normal[d];
-        area[0] += measure;
-        if (s.distance - wall_.distance(moved) < there * parameters_.gap) area[1] += measure;
-      }
+    for (const Facet &facet : facets_) {
+      PetscReal measure, middle[3], moved[3], normal[3];
+      PetscCall(DMPlexComputeCellGeometryFVM(mesh.dm(), facet.point, &measure, middle, normal));
+      const SignedDistance::Value s = wall_.at(middle);
+      const double inward = s.gradient[0] * normal[0] + s.gradient[1] * normal[1] + s.gradient[2] * normal[2];
+      for (int d = 0; d < 3; ++d) moved[d] = middle[d] - std::copysign(facet.gap, inward) * normal[d];
+      area[0] += measure;
+      if (facet.gap <= 0 || s.distance - wall_.distance(moved) >= there * facet.gap) continue;
+      area[1] += measure;
+      gap = std::max<double>(gap, facet.gap);
     }
     PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, area, 2, MPI_DOUBLE, MPI_SUM, options.comm()));
+    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &gap, 1, MPI_DOUBLE, MPI_MAX, options.comm()));
     if (area[1] > told * area[0])
       PetscCall(
           PetscPrintf(options.comm(),
                       "pulmo: warning: -cavity_gap %g mm: on %.2g %% of the surface the wall is not there: the "
                       "surface folds, or parts of it are closer to each other, and their cavities are one; give a "
                       "smaller gap, or the cavity's surface by -cavity_file\n",
-                      (double)parameters_.gap, 100 * area[1] / area[0]));
+                      gap, 100 * area[1] / area[0]));
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
@@ -324,6 +367,8 @@ private:
   PetscReal spacing_ = 0, scale_ = 1;
   ClosedSurface surface_; ///< that the wall is made of
   SignedDistance wall_;
+  std::vector<Facet> facets_; ///< that touch it
+  PetscReal largest_gap_ = 0; ///< mm
   mutable CavityKernels::Parameters parameters_;
 };
 
