@@ -97,8 +97,8 @@ PetscErrorCode keep_last_state(Checkpoint &checkpoint, const Simulation &simulat
   std::string complaint;
 
   PetscFunctionBeginUser;
-  // the start is no loss, and at the end nothing is left to run
-  if (simulation.rows().size() < 2 || simulation.at_end()) PetscFunctionReturn(PETSC_SUCCESS);
+  // the start is no loss, and at the end nothing is left to run; what a load does a restart has to keep
+  if (simulation.given_up() || simulation.rows().size() < 2 || simulation.at_end()) PetscFunctionReturn(PETSC_SUCCESS);
   PetscCall(checkpoint.write(complaint));
   text = complaint.empty() ? " With another solver go on from there: -restart " + checkpoint.path() + "."
                            : " No checkpoint: " + complaint + ".";

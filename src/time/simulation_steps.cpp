@@ -100,7 +100,9 @@ PetscErrorCode Simulation::after_stage()
   for (Partner *partner : partners_) {
     std::string why;
     PetscCall(partner->give_up(why));
-    if (!why.empty() && unsolved_.empty()) unsolved_ = why + ".";
+    if (why.empty() || !unsolved_.empty()) continue;
+    unsolved_ = why + ".";
+    given_up_ = true;
   }
   if (!unsolved_.empty()) {
     PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));

@@ -72,6 +72,8 @@ public:
   PetscErrorCode end_unsolved(const std::string &what, const std::string &left);
   /// One paragraph on a run that could not go on: where, when, what was tried, what to try.
   std::string failure_text() const;
+  /// Whether a partner ended such a run, for what no solver mends.
+  bool given_up() const { return given_up_; }
   /// Where and why such a run ended.
   const Diagnosis &diagnosis() const { return diagnosis_; }
 
@@ -165,6 +167,7 @@ private:
   StepControl::Value candidate_; ///< at the end of the step that is to be accepted
   Balance balance_;
   std::string unsolved_; ///< why the run ends, if it is not solved
+  bool given_up_ = false;
   Predictor predictor_;
   PinForces pins_;
   Lagging lagging_;
