@@ -1,6 +1,7 @@
 // How far the tissue of a scene goes, beside the pressures of its run.
 #include "pulmo/base/units.hpp"
 #include "pulmo/input/errors.hpp"
+#include "pulmo/physics/effects/recruitment.hpp"
 #include "pulmo/physics/law_range.hpp"
 #include "pulmo/physics/parameter_fields.hpp"
 #include "pulmo/program/scene_view.hpp"
@@ -62,6 +63,35 @@ PetscReal largest_suction(const SceneFacts &facts, const PetscScalar constants[]
     largest = std::max(largest, facts.pleural_suction(end * i / looks, constants));
   return largest;
 }
+
+/// What recruitment makes of the volume, over that with what is open in the mesh: all closed, all open.
+struct Recruited {
+  PetscReal least = 1, most = 1;
+
+  /// Of the whole lung. Collective.
+  PetscErrorCode find(const Composition &composition)
+  {
+    using P = RecruitmentKernels::Parameters;
+    const DM dm = composition.mesh().dm();
+    std::vector<PetscScalar> all = composition.constants(Step());
+    PetscReal extremes[2] = {-1, 1}; // -least, most
+    PetscInt begin, end;
+
+    PetscFunctionBeginUser;
+    if (constants::offset_of(constants::tag(P::owner), all.data()) <= 0) PetscFunctionReturn(PETSC_SUCCESS);
+    PetscCall(DMPlexGetHeightStratum(dm, 0, &begin, &end));
+    for (PetscInt c = 0; c < end - begin; ++c) {
+      if (composition.varying()) composition.varying()->patch(c, "", all);
+      const P k = constants::get<P>(all.data());
+      extremes[0] = std::max(extremes[0], -RecruitmentKernels::volume_ratio(0, k));
+      extremes[1] = std::max(extremes[1], RecruitmentKernels::volume_ratio(1, k));
+    }
+    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, extremes, 2, MPIU_REAL, MPI_MAX, PetscObjectComm((PetscObject)dm)));
+    least = -extremes[0];
+    most = extremes[1];
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+};
 
 /// Tissue with one set of parameters.
 struct Part {
@@ -264,15 +294,21 @@ PetscErrorCode describe_range(const Scene &scene, const Model &model, std::vecto
                   end = facts.ventilator ? facts.ventilator->phases().back().end : 1,
                   muscles = largest_suction(facts, model.composition().constants(Step()).data(), end);
   Parts parts(scene, model);
+  Recruited recruited;
 
   PetscFunctionBeginUser;
   PetscCall(parts.find());
+  PetscCall(recruited.find(model.composition()));
   lines.emplace_back(
       "A piece of tissue that inflates alone and evenly, without springs, weight, film or neighbours; J is "
       "its volume over that in the mesh.");
   if (facts.prestress)
     lines.push_back("In the mesh it is under " + number(prestress / units::kPa_per_cmH2O) +
                     " cmH2O already (-prestress); pressures count from there.");
+  if (recruited.most > 1 || recruited.least < 1)
+    lines.push_back("What opens and closes (-recruitment) is not in it, either: at each pressure J is up to " +
+                    number(recruited.most) + " times what is told once all is open, and " + number(recruited.least) +
+                    " times where all is closed.");
   if (parts.many())
     lines.emplace_back("Its parameters differ from place to place; these are the softest and the stiffest at rest.");
   bool wide = false;
@@ -290,7 +326,7 @@ PetscErrorCode describe_range(const Scene &scene, const Model &model, std::vecto
     if (prescribed.pressures) {
       told = inflation.at_pressure("at the lowest pressure of the ventilator,", prescribed.lowest) + "; " +
              inflation.at_pressure("at the highest,", prescribed.highest);
-      wide = wide || inflation.J_at(prescribed.highest + muscles) > full_lung;
+      wide = wide || inflation.J_at(prescribed.highest + muscles) * recruited.most > full_lung;
     }
     if (muscles > 0)
       told += (told.empty() ? "" : "; ") +

@@ -119,6 +119,13 @@ class Range(unittest.TestCase):
         self.assertAlmostEqual(after(text, "softest at J ="), slope.x / J0, delta=0.006)
         self.assertAlmostEqual(after(text, f"softest at J = {slope.x / J0:.3g} ("), pulmo.gas_pressure("patte", slope.x) - 5, delta=0.06)
 
+    def test_recruitment_comes_on_top(self):
+        """What opens has its volume without stress."""
+        text = " ".join(self.lines(["-tissue", "ma", "-recruitment", "-recruitment_gain", "0.5", "-recruitment_start", "0.2"]))
+        self.assertAlmostEqual(after(text, "J is up to"), 1.5 / 1.1, delta=0.006)
+        self.assertAlmostEqual(after(text, "once all is open, and"), 1 / 1.1, delta=0.006)
+        self.assertNotIn("-recruitment", " ".join(self.lines(["-tissue", "ma"])))
+
     def test_each_lung_by_its_parameters(self):
         scene = told(["-dm_plex_filename", pulmo.mesh("lung_pair.msh")] + pulmo.options_file("scenes/pcv.opts") + pulmo.DIRECT +
                      ["-tissue", "yoshihara", "-tissue_c", "1.298,left_lung=2.596"])[0]
