@@ -42,6 +42,15 @@ double volume(const Place &a, const Place &b, const Place &c)
 class Words {
 public:
   explicit Words(const std::string &text) : in_(text) {}
+  /// Leaves out what is left of the line, unless @p word is in it.
+  void skip_line_without(const char *word)
+  {
+    const auto place = in_.tellg();
+    std::string line;
+    if (!std::getline(in_, line) || lower(line).find(word) == std::string::npos) return;
+    in_.clear();
+    in_.seekg(place);
+  }
   bool next(std::string &word)
   {
     if (!(in_ >> word)) return false;
@@ -61,16 +70,31 @@ private:
   std::istringstream in_;
 };
 
+/// Whether a text begins as an ASCII file does. @p begin: where, behind blanks and the mark of UTF-8.
+bool begins_as_ascii_stl(const std::string &content, std::size_t &begin)
+{
+  constexpr const char *word = "solid", *mark = "\xef\xbb\xbf";
+  begin = content.compare(0, 3, mark) == 0 ? 3 : 0;
+  while (begin < content.size() && std::isspace(static_cast<unsigned char>(content[begin]))) ++begin;
+  return lower(content.substr(begin, 5)) == word;
+}
+
+/// Behind "solid" and "endsolid" the body has a name, of any words.
 std::string read_ascii_stl(const std::string &content, std::vector<Corners> &list)
 {
   Words words(content);
   std::string word;
   Corners corners{};
   std::size_t n = 0;
+  bool within = false; // a facet
 
   while (words.next(word)) {
-    if (word == "facet") n = 0;
-    if (word == "vertex") {
+    if (word == "solid" || word == "endsolid") words.skip_line_without("normal"); // all may stand in one line
+    if (word == "facet") {
+      n = 0;
+      within = true;
+    }
+    if (word == "vertex" && within) {
       if (n == 3) return "has a facet of more than three vertices";
       for (double &x : corners[n])
         if (!words.number(x))
@@ -78,13 +102,14 @@ std::string read_ascii_stl(const std::string &content, std::vector<Corners> &lis
       if (++n == 3) list.push_back(corners);
     }
     if (word == "endfacet" && n != 3) return "has a facet of fewer than three vertices";
+    if (word == "endfacet") within = false;
   }
   return list.empty() ? "holds no facets" : "";
 }
 
 std::string read_binary_stl(const std::string &content, std::vector<Corners> &list)
 {
-  for (std::size_t at = stl_head; at < content.size(); at += stl_triangle) {
+  for (std::size_t at = stl_head; at + stl_triangle <= content.size(); at += stl_triangle) {
     float x[9]; // after the normal
     std::memcpy(x, content.data() + at + 3 * sizeof(float), sizeof(x));
     Corners corners;
@@ -264,12 +289,14 @@ std::string join_triangles(std::vector<Corners> list, ClosedSurface &surface)
 std::string read_stl(const std::string &content, std::vector<Corners> &list)
 {
   std::uint32_t n = 0;
+  std::size_t begin;
 
   list.clear();
   if (content.size() >= stl_head) std::memcpy(&n, content.data() + stl_head - sizeof(n), sizeof(n));
-  if (content.size() >= stl_head && content.size() == stl_head + stl_triangle * n)
-    return read_binary_stl(content, list);
-  if (content.compare(0, 5, "solid") == 0) return read_ascii_stl(content, list);
+  const std::size_t whole = stl_head + stl_triangle * n;
+  // some programs leave a few bytes behind the last facet; in a text these four are letters, and n far too large
+  if (content.size() >= whole && content.size() < whole + stl_triangle) return read_binary_stl(content, list);
+  if (begins_as_ascii_stl(content, begin)) return read_ascii_stl(content.substr(begin), list);
   return "is no readable STL file: it neither begins with 'solid' (ASCII) nor has the length that its number of facets "
          "asks for (binary)";
 }

@@ -117,6 +117,28 @@ TEST(ClosedSurface, ReadsBothKindsOfStl)
   }
 }
 
+TEST(ClosedSurface, ReadsStlAsProgramsWriteIt)
+{
+  const List list = box({2, 3, 4});
+  const std::string plain = ascii(list);
+  const std::size_t name = plain.find('\n');
+  std::string upper = plain, one_line = plain, returns = plain;
+  std::transform(upper.begin(), upper.end(), upper.begin(), [](unsigned char c) { return std::toupper(c); });
+  std::replace(one_line.begin(), one_line.end(), '\n', ' ');
+  one_line.replace(one_line.find("facet"), 5, "facet normal 0 0 1");
+  std::replace(returns.begin(), returns.end(), '\n', '\r');
+  for (const std::string &content :
+       {upper, " \n\t" + plain, "\xef\xbb\xbf" + plain, "solid vertex group" + plain.substr(name),
+        "solid facet of vertex 3" + plain.substr(name), "SOLID" + plain.substr(name) + "\nendsolid vertex\n", one_line,
+        returns, binary(list) + std::string(3, '\n'), binary(list) + std::string(49, '\0')}) {
+    List read;
+    EXPECT_EQ(read_stl(content, read), "") << content.substr(0, 40);
+    EXPECT_EQ(read, list) << content.substr(0, 40);
+  }
+  List read;
+  EXPECT_NE(read_stl(binary(list) + std::string(50, '\0'), read), "");
+}
+
 TEST(ClosedSurface, NeitherOrderNorSideShows)
 {
   List list = box({2, 3, 4});
