@@ -8,6 +8,7 @@
 #include "pulmo/mesh/shared_points.hpp"
 
 #include <algorithm>
+#include <cctype>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
@@ -156,6 +157,90 @@ void take_triangles(const MeshFile &mesh, std::vector<Corners> &list)
       list.push_back({mesh.nodes[face.first[0]], mesh.nodes[face.first[1]], mesh.nodes[face.first[2]]});
 }
 
+/// The solid angle of a triangle seen from @p x (Van Oosterom & Strackee 1983).
+double solid_angle(const Place &x, const Place &a, const Place &b, const Place &c)
+{
+  Place r[3] = {a, b, c};
+  double length[3], dot[3];
+  for (int i = 0; i < 3; ++i) {
+    for (int d = 0; d < 3; ++d) r[i][d] -= x[d];
+    length[i] = std::hypot(r[i][0], r[i][1], r[i][2]);
+  }
+  for (int i = 0; i < 3; ++i) {
+    const Place &p = r[(i + 1) % 3], &q = r[(i + 2) % 3];
+    dot[i] = p[0] * q[0] + p[1] * q[1] + p[2] * q[2];
+  }
+  return 2 * std::atan2(volume(r[0], r[1], r[2]), length[0] * length[1] * length[2] + dot[0] * length[0] +
+                                                      dot[1] * length[1] + dot[2] * length[2]);
+}
+
+/// Bodies are triangles that are joined along edges. Each is turned by itself: outwards, or as a hole where it lies in
+/// an odd number of others. Returns what is wrong, as join_triangles().
+std::string turn_bodies(ClosedSurface &surface)
+{
+  struct Body {
+    std::vector<std::size_t> triangles;
+    double six_volumes = 0;
+    Place low, high;
+  };
+  constexpr double half_sphere = 2 * PETSC_PI;
+  constexpr std::size_t looks = 16;                 // at places of a body
+  std::map<std::pair<int, int>, std::size_t> edges; // the triangle that runs along it
+  std::vector<char> taken(surface.triangles.size(), 0);
+  std::vector<Body> bodies;
+  const auto corner = [&](std::size_t t, int i) -> const Place & { return surface.nodes[surface.triangles[t][i]]; };
+
+  for (std::size_t t = 0; t < surface.triangles.size(); ++t)
+    for (int i = 0; i < 3; ++i) edges[{surface.triangles[t][i], surface.triangles[t][(i + 1) % 3]}] = t;
+  for (std::size_t first = 0; first < taken.size(); ++first) {
+    if (taken[first]) continue;
+    Body body;
+    body.triangles = {first};
+    body.low = body.high = corner(first, 0);
+    taken[first] = 1;
+    for (std::size_t k = 0; k < body.triangles.size(); ++k) {
+      const std::size_t t = body.triangles[k];
+      body.six_volumes += volume(corner(t, 0), corner(t, 1), corner(t, 2));
+      for (int i = 0; i < 3; ++i) {
+        for (int d = 0; d < 3; ++d) {
+          body.low[d] = std::min(body.low[d], corner(t, i)[d]);
+          body.high[d] = std::max(body.high[d], corner(t, i)[d]);
+        }
+        const std::size_t next = edges[{surface.triangles[t][(i + 1) % 3], surface.triangles[t][i]}];
+        if (taken[next]) continue;
+        taken[next] = 1;
+        body.triangles.push_back(next);
+      }
+    }
+    bodies.push_back(std::move(body));
+  }
+  if (std::all_of(bodies.begin(), bodies.end(), [](const Body &body) { return body.six_volumes == 0; }))
+    return "encloses no volume";
+  const auto within = [&](const Body &body, const Body &other) { // bodies that cut each other are not
+    for (int d = 0; d < 3; ++d)
+      if (body.low[d] <= other.low[d] || body.high[d] >= other.high[d]) return false;
+    const std::size_t step = (body.triangles.size() + looks - 1) / looks;
+    for (std::size_t k = 0; k < body.triangles.size(); k += step) {
+      Place middle{0, 0, 0};
+      double angle = 0;
+      for (int i = 0; i < 3; ++i)
+        for (int d = 0; d < 3; ++d) middle[d] += corner(body.triangles[k], i)[d] / 3;
+      for (const std::size_t t : other.triangles)
+        angle += solid_angle(middle, corner(t, 0), corner(t, 1), corner(t, 2));
+      if (std::abs(angle) < half_sphere) return false;
+    }
+    return true;
+  };
+  for (const Body &body : bodies) {
+    bool hole = false;
+    for (const Body &other : bodies)
+      if (&other != &body && within(body, other)) hole = !hole;
+    if ((body.six_volumes > 0) == hole)
+      for (const std::size_t t : body.triangles) std::swap(surface.triangles[t][1], surface.triangles[t][2]);
+  }
+  return "";
+}
+
 PetscErrorCode read_on_root(const std::string &file, PetscReal scale, ClosedSurface &surface, std::string &fault)
 {
   std::vector<Corners> list;
@@ -238,7 +323,6 @@ std::string join_triangles(std::vector<Corners> list, ClosedSurface &surface)
 {
   std::map<Place, int> number;
   std::map<std::pair<int, int>, int> edges; // how many triangles run along it
-  double six_volumes = 0;
 
   surface = {};
   for (Corners &corners : list) {
@@ -278,12 +362,7 @@ std::string join_triangles(std::vector<Corners> list, ClosedSurface &surface)
   if (open > 0)
     return "has " + std::to_string(open) + " edges of one triangle alone (one is at " + text_of(*where) +
            "): close its holes, and join corners that are the same";
-  for (const auto &t : surface.triangles)
-    six_volumes += volume(surface.nodes[t[0]], surface.nodes[t[1]], surface.nodes[t[2]]);
-  if (six_volumes == 0) return "encloses no volume";
-  if (six_volumes < 0)
-    for (auto &t : surface.triangles) std::swap(t[1], t[2]);
-  return "";
+  return turn_bodies(surface);
 }
 
 std::string read_stl(const std::string &content, std::vector<Corners> &list)

@@ -139,6 +139,38 @@ TEST(ClosedSurface, ReadsStlAsProgramsWriteIt)
   EXPECT_NE(read_stl(binary(list) + std::string(50, '\0'), read), "");
 }
 
+TEST(ClosedSurface, EachBodyIsTurnedByItself)
+{
+  const auto moved = [](List list, double by, bool inside_out) {
+    for (auto &t : list) {
+      for (Place &x : t)
+        for (double &component : x) component += by;
+      if (inside_out) std::swap(t[0], t[1]);
+    }
+    return list;
+  };
+  const auto joined = [](const std::vector<List> &bodies) {
+    List list;
+    for (const List &body : bodies) list.insert(list.end(), body.begin(), body.end());
+    return list;
+  };
+  const List outer = box({20, 20, 20}), inner = box({8, 8, 8}), core = box({2, 2, 2});
+  for (int turned = 0; turned < 8; ++turned) { // whichever is inside out
+    const bool first = turned & 1, second = turned & 2, third = turned & 4;
+    const SignedDistance apart = distance_from(joined({moved(outer, 0, first), moved(inner, 30, second)}), 0.5, 5);
+    for (const Place &x : {Place{10, 10, 10}, {34, 34, 34}}) EXPECT_GT(apart.distance(x.data()), 3);
+    if (turned < 4) { // two that cut each other
+      const SignedDistance cut = distance_from(joined({moved(outer, 0, first), moved(inner, 15, second)}), 0.5, 5);
+      for (const Place &x : {Place{5, 5, 5}, {21.5, 21.5, 21.5}}) EXPECT_GT(cut.distance(x.data()), 1);
+    }
+    // a body in a hole of another
+    const SignedDistance nested =
+        distance_from(joined({moved(outer, 0, first), moved(inner, 6, second), moved(core, 9, third)}), 0.5, 5);
+    for (const Place &x : {Place{3, 10, 10}, {10, 10, 10}}) EXPECT_GT(nested.distance(x.data()), 0.5);
+    for (const Place &x : {Place{7.5, 10, 10}, {-2, 10, 10}}) EXPECT_LT(nested.distance(x.data()), -1);
+  }
+}
+
 TEST(ClosedSurface, NeitherOrderNorSideShows)
 {
   List list = box({2, 3, 4});

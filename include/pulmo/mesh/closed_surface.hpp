@@ -30,7 +30,8 @@ struct ClosedSurface {
   std::string hash() const;
 };
 
-/// Joins triangles where their corners are the same numbers. Returns what is wrong with them, as the words that follow
+/// Joins triangles where their corners are the same numbers, and turns each body of them outwards; one that lies within
+/// another is a hole in it. Returns what is wrong with them, as the words that follow
 /// "the surface" in a sentence; empty if nothing is.
 std::string join_triangles(std::vector<ClosedSurface::Corners> list, ClosedSurface &surface);
 
