@@ -143,10 +143,11 @@ PetscErrorCode note_load_times(MPI_Comm comm, const Scene &scene, PetscReal dt)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-/// Says where springs act on a surface that a support holds: they are never strained.
+/// Says where springs act on a surface that a support holds, or a wall: what they do moves nothing.
 PetscErrorCode note_idle_springs(MPI_Comm comm, const Composition &composition)
 {
-  const std::vector<std::string> springs = composition.surfaces_of("chest_wall");
+  const std::vector<std::string> springs = composition.surfaces_of("chest_wall"),
+                                 walls = composition.surfaces_of("cavity");
 
   PetscFunctionBeginUser;
   for (const Constraint &c : composition.constraints()) {
@@ -155,6 +156,12 @@ PetscErrorCode note_idle_springs(MPI_Comm comm, const Composition &composition)
       PetscCall(PetscPrintf(comm,
                             "pulmo: note: the springs of -chest_wall on surface '%s' do nothing: -support_surfaces "
                             "holds it; leave the surface out of one of the two (-chest_wall_surfaces)\n",
+                            c.surface.c_str()));
+    if (whole && !c.surface.empty() && std::find(walls.begin(), walls.end(), c.surface) != walls.end())
+      PetscCall(PetscPrintf(comm,
+                            "pulmo: note: the wall of -cavity on surface '%s' does nothing: -support_surfaces says "
+                            "where it goes, and through the wall, too, whatever -cavity_stiffness is; leave the "
+                            "surface out of one of the two (-cavity_surfaces)\n",
                             c.surface.c_str()));
   }
   PetscFunctionReturn(PETSC_SUCCESS);

@@ -137,6 +137,13 @@ class Column(unittest.TestCase):
         self.assertEqual(run.code, 1)
         self.assertIn("the lung is not within the cavity", run.err)
 
+    def test_a_wall_behind_a_support_is_told(self):
+        run = pulmo.Case(pulmo.BLOCK + pulmo.STILL + pulmo.TIGHT + ["-tissue", "ma", "-support", "-support_surfaces", "z0,z1", "-cavity", "-cavity_surfaces",
+                         "z1,x0", "-scene_view_only"] + pulmo.programme(UP_AND_DOWN))
+        self.assertEqual(run.code, 0, run.err)
+        self.assertIn("the wall of -cavity on surface 'z1' does nothing: -support_surfaces says where it goes", run.out)
+        self.assertNotIn("on surface 'x0'", run.out)
+
     def test_a_soft_wall_is_told(self):
         run = pulmo.finished(COLUMN + flat_wall() + ["-cavity_stiffness", "0.05"] + pulmo.programme("up 0.4 pressure 24 ramp 0.4\n"))
         self.assertIn("the wall gives way", run.out)

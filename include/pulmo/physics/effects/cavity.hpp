@@ -193,11 +193,12 @@ public:
     constexpr PetscReal percent = 100, most = 10;
     const std::size_t give = c.sum_up(3, Over::largest_of_facets, percent);
     c.signal("cavity_penetration_percent", [=](const SignalRow &row) { return row.integrals[give]; });
-    char told[200];
+    char told[300];
     PetscCall(
         PetscSNPrintf(told, sizeof(told),
                       "a penetration of more than %g %% of the gap there, or without a gap of %g %% of the lung's "
-                      "size, says that the wall gives way; give a larger -cavity_stiffness",
+                      "size, says that the wall gives way; give a larger -cavity_stiffness, or no support that drives "
+                      "the lung through it",
                       (double)most, (double)(most * no_gap)));
     c.limit(most, told);
     PetscFunctionReturn(PETSC_SUCCESS);
