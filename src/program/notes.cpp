@@ -7,6 +7,7 @@
 #include "pulmo/input/errors.hpp"
 #include "pulmo/observers/output.hpp"
 #include "pulmo/physics/effects/pressure_damping.hpp"
+#include "pulmo/program/prestress_notes.hpp"
 #include "pulmo/program/scene_view.hpp"
 
 #include <algorithm>
@@ -300,6 +301,7 @@ PetscErrorCode look_ahead(MPI_Comm comm, const Scene &scene, const Model &model,
   PetscFunctionBeginUser;
   PetscCall(note_free_boundary(model.composition(), scene.facts().airflow));
   PetscCall(warn_of_size(comm, scene));
+  PetscCall(warn_of_prestress(comm, scene, model));
   PetscCall(note_idle_springs(comm, model.composition()));
   PetscCall(check_damping(comm, scene, model));
   PetscCall(check_permeability(comm, scene, model, simulation.wanted_dt()));

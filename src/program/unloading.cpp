@@ -5,6 +5,7 @@
 #include "pulmo/fem/point_memory.hpp"
 #include "pulmo/fem/sampling.hpp"
 #include "pulmo/mesh/mesh.hpp"
+#include "pulmo/program/prestress_notes.hpp"
 #include "pulmo/solvers/preconditioning.hpp"
 
 #include <cmath>
@@ -284,6 +285,7 @@ PetscErrorCode solve_unloaded_shape(Options &options, const Scene &scene, const 
   UnloadedShape shape;
   std::vector<Vector3> pleura;
   PetscReal share, loaded, arm;
+  std::string weak;
 
   PetscFunctionBeginUser;
   Composition problem = composition.without_terms();
@@ -301,6 +303,12 @@ PetscErrorCode solve_unloaded_shape(Options &options, const Scene &scene, const 
                     "and it turns a little before it breathes\n",
                     (double)arm));
   PetscCall(shape.solve(share, loaded, unloading.left));
+  if (share < 1) PetscCall(find_weak_part(scene, composition, weak));
+  PulmoUserCheck(weak.empty(), options.comm(),
+                 "-prestress_method inverse: no unloaded shape was found beyond %.3g of the load (transpulmonary "
+                 "pressure and weight): %s, and -prestress_pressure is %g cmH2O; give less, or that part other "
+                 "parameters",
+                 (double)share, weak.c_str(), (double)(scene.facts().prestress->pressure / units::kPa_per_cmH2O));
   PulmoUserCheck(share >= 1, options.comm(),
                  "-prestress_method inverse: no unloaded shape was found beyond %.3g of the load (transpulmonary "
                  "pressure and weight); lower -prestress_pressure, take another law, or another solver file "

@@ -113,6 +113,34 @@ class Equilibrium(unittest.TestCase):
         self.assertEqual(region.code, 1)
         self.assertIn("some part of the lung", region.err)
 
+    def test_each_part_is_held_to_its_own_tissue(self):
+        """What no part has is neither refused nor told; the built-in lung is all right_lung."""
+        def told(mesh, *options):
+            run = pulmo.Case(["-dm_plex_filename", pulmo.mesh(mesh)] + pulmo.PCV + pulmo.DIRECT + ["-elements", "P1-P1", "-prestress", "-scene_view_only", *options])
+            self.assertEqual(run.code, 0, run.err)
+            return run.out
+
+        told("lung_pair.msh", "-tissue", "concha", "-tissue_wall_modulus", "1,right_lung=10.33,left_lung=20")
+        self.assertIn("nearly neutral", told("lung_test.msh", "-tissue", "concha", "-tissue_wall_modulus", "10.33,right_lung=5.85"))
+        self.assertNotIn("neutral", told("lung_test.msh", "-tissue", "concha", "-tissue_wall_modulus", "5.85,right_lung=10.33"))
+        self.assertIn("has 0.474 of the volume", told("lung_test.msh", "-tissue", "birzle", "-tissue_c", "1e-3,right_lung=0.3567"))
+        one = told("lung_pair.msh", "-tissue", "birzle", "-tissue_c", "0.3567,right_lung=2")
+        self.assertRegex(one, r"-tissue birzle \(in 1.22e\+03 ml of it\) is nearly neutral")
+
+    def test_no_lung_has_less_than_its_solid(self):
+        """ma at 5 cmH2O leaves 61 % of the volume."""
+        for method in ("stretch", "inverse"):
+            for mesh, porosity, where in (("lung_test.msh", "0.3", ""), ("lung_pair.msh", "0.9,left_lung=0.3", " (in 1.22e+03 ml of it)"),
+                                          ("lung_pair.msh", "0.5", None)):
+                with self.subTest(method=method, porosity=porosity):
+                    run = pulmo.Case(["-dm_plex_filename", pulmo.mesh(mesh)] + pulmo.PCV + pulmo.DIRECT + ["-elements", "P1-P1", "-prestress",
+                                     "-prestress_method", method, "-tissue", "ma", "-tissue_porosity", porosity, "-scene_view_only"])
+                    self.assertEqual(run.code, 0, run.err)
+                    if where is None:
+                        self.assertNotIn("less than its own solid", run.out)
+                    else:
+                        self.assertIn(f"the unloaded lung{where} has 0.612 of the volume of the mesh, less than its own solid, 1 - Phi0 = 0.7", run.out)
+
     def test_nearly_neutral_is_told(self):
         run = pulmo.finished(pulmo.LUNG + pulmo.PCV + pulmo.DIRECT + ["-tissue", "birzle", "-prestress", "-elements", "P1-P1", "-ventilator_pip",
                              "0", "-ts_max_time", "0.1"] + pulmo.QUIET)
@@ -200,6 +228,14 @@ class Inverse(unittest.TestCase):
             self.assertNotIn("settle", rows["phase"])
             ratios.append(run.json()["prestress"]["unloaded_volume_ratio"])
         self.assertAlmostEqual(*ratios, delta=1e-10)
+
+    def test_a_part_that_is_too_weak_is_named(self):
+        run = pulmo.Case(["-dm_plex_filename", pulmo.mesh("lung_pair.msh")] + pulmo.PCV + pulmo.DIRECT + ["-elements", "P1-P1", "-prestress",
+                         "-prestress_method", "inverse", "-tissue", "concha", "-tissue_wall_modulus", "10,left_lung=2"])
+        self.assertEqual(run.code, 1)
+        self.assertIn("a part of the lung (1.22e+03 ml) takes no more than 1.72 cmH2O", run.err)
+        self.assertIn("give less, or that part other parameters", run.err)
+        self.assertNotIn("solver", run.err)
 
     def test_low_parts_ventilate_more(self):
         """In the supine lung, per volume, as in a living one: with the weight in the unloaded shape, and not with a uniform stretch."""

@@ -24,6 +24,7 @@
 #include "pulmo/physics/effect.hpp"
 #include "pulmo/physics/law_range.hpp"
 
+#include <algorithm>
 #include <limits>
 
 namespace pulmo {
@@ -281,30 +282,14 @@ public:
     PetscFunctionBeginUser;
     parameters_.pressure = facts.prestress->pressure;
     const auto inflated = inflated_J(*facts.law, parameters_.pressure, nullptr, &end);
-    PulmoUserCheck(inflated, options.comm(),
+    const bool by_part = std::any_of(options.varying().begin(), options.varying().end(),
+                                     [](const auto &v) { return v.option.rfind("-tissue_", 0) == 0; });
+    // where the law differs from part to part each of them is held to its own: terms(), solve_unloaded_shape()
+    PulmoUserCheck(inflated || by_part, options.comm(),
                    "-prestress_pressure %g cmH2O: -tissue %s with these parameters takes no more than %.3g cmH2O from "
                    "rest by uniform inflation; give a pressure below that, another law, or other parameters",
                    (double)pressure_, facts.law->name(), (double)(end.pressure / units::kPa_per_cmH2O));
-    const PetscReal J0 = *inflated;
-    parameters_.stretch = std::cbrt(J0);
-    const PetscReal at_rest = inflation_stiffness(*facts.law, 1);
-    PetscReal stiffness = inflation_stiffness(*facts.law, J0); // the least on the way there
-    for (int i = 1; i < path; ++i)
-      stiffness = std::min(stiffness, inflation_stiffness(*facts.law, std::pow(J0, (PetscReal)i / path)));
-    if (J0 < least_stretch || J0 > largest_stretch)
-      PetscCall(PetscPrintf(options.comm(),
-                            "pulmo: warning: -prestress_pressure %g cmH2O with -tissue %s: the unloaded lung has %.3g "
-                            "of the volume of the mesh, which is no lung's; give the transpulmonary pressure of the "
-                            "image, some 5 cmH2O\n",
-                            (double)pressure_, facts.law->name(), (double)(1 / J0)));
-    if (stiffness < nearly_neutral * at_rest)
-      PetscCall(PetscPrintf(
-          options.comm(),
-          "pulmo: warning: -tissue %s is nearly neutral at -prestress_pressure %g cmH2O: dp/dJ is "
-          "%.3g cmH2O on the way there at its least, %.3g at rest, and the unloaded lung has %.3g of the volume; small "
-          "changes of pressure or parameters move these numbers far\n",
-          facts.law->name(), (double)pressure_, (double)(stiffness / units::kPa_per_cmH2O),
-          (double)(at_rest / units::kPa_per_cmH2O), (double)(1 / J0)));
+    parameters_.stretch = std::cbrt(inflated.value_or(1));
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
@@ -371,10 +356,6 @@ private:
     c.residual("-cof F g . eta", displacement, f0(volume_residual<P, K::pulling>));
     c.jacobian("-d(cof F)/dF g", displacement, displacement, g1(volume_jacobian<P, K::pulling_by_displacement>));
   }
-
-  static constexpr PetscReal nearly_neutral = 0.25;
-  static constexpr int path = 50;                                      ///< states that are looked at on the way to J0
-  static constexpr PetscReal least_stretch = 0.7, largest_stretch = 4; ///< J0 of a lung
 
   bool on_ = false;
   PetscReal pressure_ = 5;
