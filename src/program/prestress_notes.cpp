@@ -103,6 +103,47 @@ struct Worst {
   }
 };
 
+/// Says that the law takes the porosity for that of the unloaded tissue, and which that would be: it has the solid of
+/// the mesh, 1 - Phi = (1 - Phi0) J0, and J0 is that of a law with Phi.
+PetscErrorCode note_porosity_of_law(MPI_Comm comm, const Scene &scene, const Composition &composition)
+{
+  constexpr int halvings = 30;
+  constexpr PetscReal same = 0.01; // of the porosity
+  const TissueLaw &law = scene.tissue().law();
+  const PetscScalar *target = scene.tissue().porosity_of_law();
+  const char *owner = nullptr;
+
+  PetscFunctionBeginUser;
+  if (!target) PetscFunctionReturn(PETSC_SUCCESS);
+  const PetscInt offset = composition.constant_at(target, &owner);
+  PetscCheck(offset >= 0, comm, PETSC_ERR_ARG_WRONG, "the porosity of a law is in no block that was handed over");
+  Constants constants = composition.constants(Step());
+  StressFree::forget(constants);
+  const PetscReal solid = 1 - *target;
+  PetscReal low = LawRange::least_J, high = 1 / solid; // what law grows stiffer with its solid: J0 falls
+  for (int n = 0; n < halvings; ++n) {
+    const PetscReal J = (low + high) / 2;
+    constants[static_cast<std::size_t>(offset)] = 1 - solid * J;
+    (inflated_J(law, scene.facts().prestress->pressure, constants.data()).value_or(PETSC_MAX_REAL) > J ? low : high) =
+        J;
+  }
+  const PetscReal unloaded = 1 - solid * low;
+  if (composition.varying())
+    PetscCall(PetscPrintf(comm,
+                          "pulmo: note: -tissue %s is made from -tissue_porosity as if that were the porosity of the "
+                          "unloaded tissue; with -prestress it is that of the mesh, and the unloaded tissue has less "
+                          "(docs/effects/prestress.md says which parameters are its own)\n",
+                          law.name()));
+  else if (std::abs(unloaded - *target) > same)
+    PetscCall(PetscPrintf(comm,
+                          "pulmo: note: -tissue %s is made from -tissue_porosity %.3g as if that were the porosity of "
+                          "the unloaded tissue; with -prestress it is that of the mesh, and unloaded tissue of as much "
+                          "solid has %.3g, with %.3g of the volume (docs/effects/prestress.md says which parameters "
+                          "are its own)\n",
+                          law.name(), (double)*target, (double)unloaded, (double)(1 / low)));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 } // namespace
 
 PetscErrorCode warn_of_prestress(MPI_Comm comm, const Scene &scene, const Model &model)
@@ -171,6 +212,7 @@ PetscErrorCode warn_of_prestress(MPI_Comm comm, const Scene &scene, const Model 
                           "pressure, stiffer tissue\n",
                           (double)pressure, law, solid.where(whole).c_str(), (double)solid.told[0],
                           (double)solid.told[1]));
+  PetscCall(note_porosity_of_law(comm, scene, composition));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

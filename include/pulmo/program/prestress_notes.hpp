@@ -10,7 +10,7 @@
 namespace pulmo {
 
 /// Warns of an unloaded lung that is no lung's, of tissue that is nearly neutral on the way to the mesh, and of an
-/// unloaded lung that has less volume than its own solid. Collective.
+/// unloaded lung that has less volume than its own solid; notes a law that is made from the porosity. Collective.
 PetscErrorCode warn_of_prestress(MPI_Comm comm, const Scene &scene, const Model &model);
 
 /// Says that the tissue of a part of the lung does not take the transpulmonary pressure by uniform inflation; empty if

@@ -4,6 +4,7 @@
 By hand: tests/verification/prestress/prestress_test.py build/pulmo
 """
 import os
+import re
 import subprocess
 import sys
 import unittest
@@ -140,6 +141,16 @@ class Equilibrium(unittest.TestCase):
                         self.assertNotIn("less than its own solid", run.out)
                     else:
                         self.assertIn(f"the unloaded lung{where} has 0.612 of the volume of the mesh, less than its own solid, 1 - Phi0 = 0.7", run.out)
+
+    def test_the_porosity_of_a_law_is_told(self):
+        """And that the page's way to have the cell of the unloaded tissue conserves its solid."""
+        scene = pulmo.LUNG + pulmo.PCV + pulmo.DIRECT + ["-elements", "P1-P1", "-tissue", "concha", "-prestress", "-ts_max_time", "0.05"] + pulmo.QUIET
+        told = re.search(r"of as much solid has ([\d.]+), with ([\d.]+) of the volume", pulmo.finished(scene).out)
+        porosity, ratio = map(float, told.groups())
+        self.assertAlmostEqual(1 - porosity, (1 - 0.69) / ratio, delta=2e-3)
+        cell = ["-tissue_wall_modulus", 10.33 / ratio, "-tissue_joint_stiffness", 10.05 / ratio]
+        self.assertAlmostEqual(pulmo.finished(scene + cell).json()["prestress"]["unloaded_volume_ratio"], ratio, delta=1e-3)
+        self.assertNotIn("as much solid", pulmo.Case(pulmo.LUNG + pulmo.PCV + pulmo.DIRECT + ["-tissue", "ma", "-prestress", "-scene_view_only"]).out)
 
     def test_nearly_neutral_is_told(self):
         run = pulmo.finished(pulmo.LUNG + pulmo.PCV + pulmo.DIRECT + ["-tissue", "birzle", "-prestress", "-elements", "P1-P1", "-ventilator_pip",

@@ -22,6 +22,8 @@ public:
   const TissueLaw &law() const { return *laws_[chosen_]; }
   /// What is not named by a region of its own has.
   const Porosity &porosity() const { return porosity_; }
+  /// The copy that the law reads, among its parameters; null: it reads none.
+  const PetscScalar *porosity_of_law() const { return laws_[chosen_]->porosity(); }
   /// Whether parts of the lung have porosities of their own.
   bool porosity_varies() const { return porosity_varies_; }
 
