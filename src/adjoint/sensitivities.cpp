@@ -18,7 +18,7 @@ constexpr PetscReal difference = 1e-7;
 /// A parameter of the scene: of kernels, or of the ventilator.
 struct Parameter {
   Options::RealOption option;
-  PetscInt constant = -1;        ///< its place among those of kernels (Composition::constant_at)
+  std::vector<PetscInt> places;  ///< among the constants of kernels (Composition::constant_at); none: the ventilator's
   bool on_facets = false;        ///< nothing in the volume reads it
   bool varies = false;           ///< it differs from place to place
   std::vector<Phase> less, more; ///< the ventilator's phases with less and more of it
@@ -73,18 +73,24 @@ std::vector<Parameter> parameters_of(const Options &options, const Scene &scene,
   std::vector<Parameter> list;
   if (composition.varying()) varying = composition.varying()->offsets();
   for (const Options::RealOption &option : options.real_options()) {
-    const char *owner = nullptr;
     Parameter p;
     p.option = option;
-    p.constant = composition.constant_at(option.target, &owner);
-    p.varies = std::find(varying.begin(), varying.end(), p.constant) != varying.end();
-    if (*option.target == 0 || (composition.varying() && p.constant >= 0 && !composition.derived().empty())) continue;
-    if (p.constant < 0) {
+    p.on_facets = composition.derived().empty();
+    std::vector<PetscReal *> targets = option.copies;
+    targets.push_back(option.target);
+    for (const PetscReal *one : targets) {
+      const char *owner = nullptr;
+      const PetscInt place = composition.constant_at(one, &owner);
+      if (place < 0) continue;
+      p.places.push_back(place);
+      p.varies = p.varies || std::find(varying.begin(), varying.end(), place) != varying.end();
+      p.on_facets = p.on_facets && composition.read_on_surfaces_alone(owner);
+    }
+    if (*option.target == 0 || (composition.varying() && !p.places.empty() && !composition.derived().empty())) continue;
+    if (p.places.empty()) {
       p.less = phases_with(facts, option, -p.change());
       p.more = phases_with(facts, option, p.change());
       if (!same_times(p.less, p.more) || same_targets(p.less, p.more)) continue;
-    } else {
-      p.on_facets = composition.derived().empty() && composition.read_on_surfaces_alone(owner);
     }
     list.push_back(std::move(p));
   }
@@ -149,37 +155,22 @@ PetscErrorCode Sensitivities::attach(Simulation &simulation, const std::string &
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Sensitivities::make(const Options &options, const Scene &scene, Model &model, Simulation &simulation,
-                                   const std::vector<SignalRow> &rows, SensitivityReport &report)
+PetscErrorCode add_derivatives(const Options &options, const Scene &scene, Model &model, Sweep &sweep,
+                               const std::vector<Functional> &functionals, PetscReal tolerance,
+                               SensitivityReport &report)
 {
   const std::vector<Parameter> parameters = parameters_of(options, scene, model.composition());
-  Sweep sweep(scene, model, simulation, *trajectory_);
-  std::vector<Functional> functionals;
+  const std::size_t count = functionals.size();
   std::vector<Mesh::Region> regions;
   ByCell all, on_facets, moved; // residuals times multipliers
-  PetscLogDouble begin, end;
   PetscMPIInt rank;
 
   PetscFunctionBeginUser;
   PetscCallMPI(MPI_Comm_rank(options.comm(), &rank));
-  PetscCall(PetscTime(&begin));
-  for (const std::string &name : names_) {
-    const auto f = functional(name, rows);
-    if (!f) {
-      report.undefined.push_back(name);
-      continue;
-    }
-    functionals.push_back(*f);
-    report.numbers.push_back({f->key, f->name, f->unit, f->value});
-  }
+  for (const Functional &f : functionals) report.numbers.push_back({f.key, f.name, f.unit, f.value});
   for (const Parameter &p : parameters)
-    report.parameters.push_back({p.option.option,
-                                 p.option.unit,
-                                 *p.option.target,
-                                 p.varies,
-                                 std::vector<double>(report.numbers.size(), 0),
-                                 {}});
-  const std::size_t count = functionals.size();
+    report.parameters.push_back(
+        {p.option.option, p.option.unit, *p.option.target, p.varies, std::vector<double>(count, 0), {}});
   std::vector<ByCell> by_cell(
       parameters.size(), ByCell(count, std::vector<PetscReal>(static_cast<std::size_t>(model.assembly().cells()), 0)));
   const auto residual = [&](const Sweep::Solved &stage, bool facets, ByCell &sums) -> PetscErrorCode {
@@ -197,22 +188,22 @@ PetscErrorCode Sensitivities::make(const Options &options, const Scene &scene, M
     for (std::size_t i = 0; i < parameters.size(); ++i) {
       const Parameter &p = parameters[i];
       const PetscReal change = p.change();
-      if (p.constant < 0) {
+      if (p.places.empty()) {
         const PetscReal by_parameter = (target(record, p.more) - target(record, p.less)) / (2 * change);
         for (std::size_t k = 0; k < count; ++k)
           report.parameters[i].derivative[k] += rank == 0 ? stage.by_target[k] * by_parameter : 0;
         continue;
       }
-      model.change_parameter(p.constant, change);
+      model.change_parameter(p.places, change);
       PetscCall(residual(stage, p.on_facets, moved));
-      model.change_parameter(p.constant, 0);
+      model.change_parameter({}, 0);
       const ByCell &base = p.on_facets ? on_facets : all;
       for (std::size_t k = 0; k < count; ++k)
         for (std::size_t c = 0; c < moved[k].size(); ++c) by_cell[i][k][c] += (moved[k][c] - base[k][c]) / change;
     }
     PetscFunctionReturn(PETSC_SUCCESS);
   };
-  if (!report.numbers.empty()) PetscCall(sweep.run(functionals, tolerance_, visit, report.failure));
+  if (count > 0) PetscCall(sweep.run(functionals, tolerance, visit, report.failure));
   PetscCall(scene.mesh().regions(regions));
   for (std::size_t i = 0; i < parameters.size(); ++i) {
     SensitivityReport::Parameter &row = report.parameters[i];
@@ -220,7 +211,7 @@ PetscErrorCode Sensitivities::make(const Options &options, const Scene &scene, M
       for (const PetscReal part : by_cell[i][k]) row.derivative[k] += part;
     PetscCall(sum_up(options.comm(), row.derivative));
     for (const Mesh::Region &region : regions) {
-      if (parameters[i].constant < 0) break;
+      if (parameters[i].places.empty()) break;
       std::vector<double> sums(count, 0);
       for (std::size_t k = 0; k < count; ++k)
         for (const PetscInt c : region.cells) sums[k] += by_cell[i][k][static_cast<std::size_t>(c)];
@@ -228,10 +219,30 @@ PetscErrorCode Sensitivities::make(const Options &options, const Scene &scene, M
       row.by_region.emplace_back(region.name, sums);
     }
   }
-  PetscCall(PetscTime(&end));
-  report.seconds = end - begin;
   report.solves = static_cast<int>(sweep.solves());
   report.krylov = static_cast<int>(sweep.krylov());
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Sensitivities::make(const Options &options, const Scene &scene, Model &model, Simulation &simulation,
+                                   const std::vector<SignalRow> &rows, SensitivityReport &report)
+{
+  Sweep sweep(scene, model, simulation, *trajectory_);
+  std::vector<Functional> functionals;
+  PetscLogDouble begin, end;
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscTime(&begin));
+  for (const std::string &name : names_) {
+    const auto f = functional(name, rows);
+    if (f)
+      functionals.push_back(*f);
+    else
+      report.undefined.push_back(name);
+  }
+  PetscCall(add_derivatives(options, scene, model, sweep, functionals, tolerance_, report));
+  PetscCall(PetscTime(&end));
+  report.seconds = end - begin;
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

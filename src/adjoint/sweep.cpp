@@ -165,13 +165,18 @@ PetscErrorCode Sweep::solve(Vec right, Vec solution, std::string &failure)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Sweep::compare_rates(const StageRecord &record, Vec z)
+PetscErrorCode Sweep::compare_rates(const StageRecord &record)
 {
   const PetscReal slope = record.stage.slope;
-  VecHandle by_rate, by_gas;
+  VecHandle z, by_rate, by_gas;
+  PetscRandom random;
   PetscReal left, size;
 
   PetscFunctionBeginUser;
+  PetscCall(create(z)); // multipliers of a stage may have nothing that a rate acts on
+  PetscCall(PetscRandomCreate(PETSC_COMM_SELF, &random));
+  PetscCall(VecSetRandom(z, random));
+  PetscCall(PetscRandomDestroy(&random));
   PetscCall(create(by_rate));
   PetscCall(create(by_gas));
   PetscCall(model_.add_transposed_product(record.time, x_, rate_, 0, z, by_gas));
@@ -196,7 +201,7 @@ PetscErrorCode Sweep::look_back(const StageRecord &record, Vec z, std::size_t fu
   const PetscReal slope = record.stage.slope, scale = gas_ ? model_.row_scale(pressure) : 0;
 
   PetscFunctionBeginUser;
-  if (!other_rates_) PetscCall(compare_rates(record, z));
+  if (!other_rates_) PetscCall(compare_rates(record));
   if (*other_rates_) { // (dR/dx_t)^T z, of a multistep rate without the gas
     PetscCall(VecZeroEntries(other_));
     PetscCall(model_.add_transposed_product(record.time, x_, rate_, 0, z, other_));
@@ -337,6 +342,12 @@ PetscErrorCode Sweep::run(const std::vector<Functional> &functionals, PetscReal 
       Wanted &w = want[k];
       Vec z = adjoint[k];
       PetscReal by_column, at_nodes = 0, target;
+      result.adjoint.push_back(z);
+      result.by_target.push_back(0);
+      if (w.nothing()) { // no later row of this number
+        PetscCall(VecZeroEntries(z));
+        continue;
+      }
       PetscCall(close(rights[k]));
       PetscCall(solve(rights[k], solution, failure));
       PetscCall(to_local(solution, z));
@@ -364,8 +375,7 @@ PetscErrorCode Sweep::run(const std::vector<Functional> &functionals, PetscReal 
       else
         want_ventilator_pressure(record.phase_start, target * airway.by_start, start);
       PetscCall(look_back(record, z, k, pending));
-      result.adjoint.push_back(z);
-      result.by_target.push_back(target);
+      result.by_target.back() = target;
     }
     if (!failure.empty()) break;
     if (visit) PetscCall(visit(result));

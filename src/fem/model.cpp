@@ -364,7 +364,7 @@ PetscErrorCode Model::pack_constants()
   PetscFunctionBeginUser;
   constants_ = composition().constants(step_);
   if (change_.by != 0) {
-    constants_[static_cast<std::size_t>(change_.constant)] += change_.by;
+    for (const PetscInt place : change_.places) constants_[static_cast<std::size_t>(place)] += change_.by;
     for (const DerivedParameter &derived : composition().derived()) {
       const char *owner;
       const PetscInt place = composition().constant_at(derived.target, &owner);
@@ -504,17 +504,17 @@ PetscErrorCode Model::residual(PetscReal t, Vec x, Vec x_t, Vec F)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-void Model::change_parameter(PetscInt constant, PetscReal change)
+void Model::change_parameter(const std::vector<PetscInt> &places, PetscReal change)
 {
   const ParameterFields *varying = composition().varying();
-  if (varying) {
-    const auto &offsets = varying->offsets();
-    const auto found = std::find(offsets.begin(), offsets.end(), constant);
-    if (found != offsets.end()) {
-      assembly_.change_varying(static_cast<std::size_t>(found - offsets.begin()), change - change_.by);
-    }
-  }
-  change_ = {constant, change};
+  const auto add = [&](PetscReal by) {
+    for (std::size_t i = 0; varying && i < varying->offsets().size(); ++i)
+      if (std::find(change_.places.begin(), change_.places.end(), varying->offsets()[i]) != change_.places.end())
+        assembly_.change_varying(i, by);
+  };
+  add(-change_.by);
+  change_ = {places, change};
+  add(change);
 }
 
 /// PETSc's own loop over cells, then the scaling of the rows.

@@ -227,7 +227,10 @@ std::vector<Options::RealOption> Options::real_options() const
 {
   std::vector<RealOption> list;
   for (const Declared &d : declared_)
-    if (groups_[d.group].in_use && d.target) list.push_back({d.name, d.unit, d.target});
+    if (groups_[d.group].in_use && d.target) {
+      const auto copies = copies_.find(d.target);
+      list.push_back({d.name, d.unit, d.target, copies == copies_.end() ? std::vector<PetscReal *>() : copies->second});
+    }
   return list;
 }
 

@@ -114,6 +114,7 @@ PetscErrorCode Options::real(const std::string &name, const std::string &unit, R
   declared_.back().target = &value;
   if (is_given) {
     drop_varying(value);
+    for (auto &[from, copies] : copies_) copies.erase(std::remove(copies.begin(), copies.end(), &value), copies.end());
     PetscCall(parse_varying(full(name), raw, unit, range, value));
   }
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -221,6 +222,7 @@ bool Options::varies(const PetscReal &value) const
 void Options::hand_down(const PetscReal &from, PetscReal &to)
 {
   to = from;
+  copies_[&from].push_back(&to);
   for (std::size_t i = 0, n = varying_.size(); i < n; ++i) {
     if (varying_[i].target != &from) continue;
     Varying copy = varying_[i];

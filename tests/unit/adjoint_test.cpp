@@ -39,6 +39,8 @@ PetscErrorCode run_scene(const std::string &options, bool sweeps, Swept &result)
   PetscCall(run.simulation().run(finished));
   PetscCheck(finished, PETSC_COMM_SELF, PETSC_ERR_LIB, "%s", run.simulation().failure_text().c_str());
   result.rows = run.simulation().rows();
+  for (SignalRow &row : result.rows) // as RegionAudit::complete() has it
+    row.flow_resistance = run.scene().facts().airflow || run.scene().facts().tube;
   result.rejected = run.simulation().rejected_steps();
   if (sweeps)
     PetscCall(
@@ -121,9 +123,9 @@ PetscErrorCode Tangent::run(std::vector<PetscReal> &volume, std::vector<PetscRea
     model_.set_load(r.load);
     PetscCall(residual(r, x, x_t, airway.pressure, airway.flow, F));
     // by the parameter
-    model_.change_parameter(constant_, change_);
+    model_.change_parameter({constant_}, change_);
     PetscCall(residual(r, x, x_t, airway.pressure, airway.flow, by_parameter));
-    model_.change_parameter(constant_, 0);
+    model_.change_parameter({}, 0);
     PetscCall(VecAXPBY(by_parameter, -1 / change_, 1 / change_, F));
     // by the pressure of a held airway, or the flow prescribed on a free one
     const PetscReal step = free ? slope * L * L * L : model_.modulus();
@@ -233,7 +235,7 @@ protected:
 
 #define GAS "-airflow -airflow_permeability 1 -airflow_surfaces x1 "
 #define PCV                                                                                                            \
-  "-ventilator pcv -ventilator_pip 3 -ventilator_inspiration 0.4 -ventilator_expiration 0.4 -ventilator_ramp 0.1 "
+  "-ventilator pcv -ventilator_pip 1.5 -ventilator_inspiration 0.4 -ventilator_expiration 0.4 -ventilator_ramp 0.1 "
 #define VCV                                                                                                            \
   "-ventilator vcv -ventilator_tidal_volume 1e-5 -ventilator_inspiration 0.3 -ventilator_pause 0.2 "                   \
   "-ventilator_expiration 0.3 -ventilator_ramp_down 0.2 "
@@ -246,7 +248,7 @@ TEST_P(Adjoint, IsTheDerivativeOfTheRun)
   ASSERT_EQ(swept.report.failure, "");
   ASSERT_GE(swept.report.numbers.size(), 4u);
   ASSERT_GE(swept.report.parameters.size(), 3u);
-  EXPECT_EQ(swept.rejected > 5, GetParam().cut);
+  EXPECT_EQ(swept.rejected > 0, GetParam().cut);
   for (const SensitivityReport::Parameter &parameter : swept.report.parameters) {
     SCOPED_TRACE(parameter.option);
     const double share = GetParam().share;
@@ -317,10 +319,10 @@ TEST_P(AdjointIdentity, SweepAndTangentAgree)
       const StageRecord &r = stage.record;
       PetscFunctionBeginUser;
       PetscCall(model.residual(r.time, stage.state, stage.rate, at));
-      model.change_parameter(constant, change);
+      model.change_parameter({constant}, change);
       PetscCall(model.set_step(r.stage, r.airway.pressure, r.airway.flow));
       PetscCall(model.residual(r.time, stage.state, stage.rate, moved));
-      model.change_parameter(constant, 0);
+      model.change_parameter({}, 0);
       PetscCall(VecAXPY(moved, -1, at));
       for (std::size_t k = 0; k < list.size(); ++k) {
         PetscReal sum;
@@ -364,9 +366,10 @@ std::vector<Breath> breaths(bool forward)
       Breath{"two_breaths_with_peep", GAS VCV "-ventilator_peep 2 -ventilator_breaths 2", 1e-3, false, true},
       Breath{"bdf", GAS PCV "-ts_type bdf"},
       Breath{"bdf_volume_control", GAS VCV "-ts_type bdf"},
-      Breath{"jump", GAS PCV "-ventilator_ramp 0 -ts_dt 0.05 -ventilator_pip 2"},
-      Breath{"cut_steps", GAS PCV "-airflow_permeability 10 -snes_max_it 5", 1e-5, true, true},
-      Breath{"cut_steps_of_bdf", GAS PCV "-airflow_permeability 10 -snes_max_it 5 -ts_type bdf", 1e-5, true}};
+      Breath{"jump", GAS PCV "-ventilator_ramp 0 -ts_dt 0.05"},
+      Breath{"cut_steps", GAS PCV "-airflow_permeability 10 -ventilator_pip 3 -snes_max_it 5", 1e-5, true, true},
+      Breath{"cut_steps_of_bdf", GAS PCV "-airflow_permeability 10 -ventilator_pip 3 -snes_max_it 5 -ts_type bdf", 1e-5,
+             true}};
   if (forward)
     list.erase(std::remove_if(list.begin(), list.end(), [](const Breath &b) { return !b.forward; }), list.end());
   return list;

@@ -139,5 +139,7 @@ PetscErrorCode check_schemes(const Subject &subject, Findings &findings);
 PetscErrorCode check_help(const Subject &subject, Findings &findings);
 PetscErrorCode check_ledger(const Subject &subject, Findings &findings);
 PetscErrorCode check_values(const Subject &subject, Findings &findings);
+/// Beside these: the sweep back over a run, of each effect that it takes, against differences of whole runs.
+PetscErrorCode check_adjoint(const Subject &subject, Findings &findings);
 
 } // namespace pulmo::test

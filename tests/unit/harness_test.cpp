@@ -69,6 +69,14 @@ TEST_P(Harness, FindsNothing)
 INSTANTIATE_TEST_SUITE_P(Registered, Harness, testing::ValuesIn(checks()),
                          [](const auto &check) { return std::string(check.param.name); });
 
+TEST(HarnessAdjoint, TheSweepIsTheDerivativeWithEachEffect)
+{
+  for (const Subject &subject : scenes().alone) {
+    SCOPED_TRACE(subject.text());
+    for (const std::string &finding : find({"adjoint", check_adjoint, false}, subject)) ADD_FAILURE() << finding;
+  }
+}
+
 TEST(HarnessScenes, EachEffectIsTakenAndEachRefusalIsASentence)
 {
   for (const std::string &text : scenes().refused) ADD_FAILURE() << text;

@@ -7,6 +7,12 @@
 
 namespace pulmo {
 
+/// Sweeps back for @p functionals and adds them and their derivatives by all parameters of the scene to @p report.
+/// @p tolerance: of the linear systems, relative. Collective.
+PetscErrorCode add_derivatives(const Options &options, const Scene &scene, Model &model, Sweep &sweep,
+                               const std::vector<Functional> &functionals, PetscReal tolerance,
+                               SensitivityReport &report);
+
 /// Records a run and sweeps back over it.
 class Sensitivities {
 public:

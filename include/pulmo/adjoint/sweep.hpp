@@ -53,6 +53,7 @@ private:
   struct Wanted {
     VecHandle state;                              ///< local, to be summed over the ranks; null: nothing
     PetscReal volume = 0, pressure = 0, flow = 0; ///< per mm^3, kPa (at the opening), mm^3/s
+    bool nothing() const { return !state && volume == 0 && pressure == 0 && flow == 0; }
   };
   using Pending = std::map<PetscInt, std::vector<Wanted>>;
 
@@ -73,7 +74,7 @@ private:
   /// Adds (dR/dx_i)^T z for the stages that @p record looks back at.
   PetscErrorCode look_back(const StageRecord &record, Vec z, std::size_t functional, Pending &pending);
   /// Whether rates act in the kernels by more than the gas that is stored.
-  PetscErrorCode compare_rates(const StageRecord &record, Vec z);
+  PetscErrorCode compare_rates(const StageRecord &record);
 
   const Scene &scene_;
   Model &model_;

@@ -105,10 +105,10 @@ public:
   /// What effects remember at the points; null if none does.
   PointMemory *memory() const { return memory_.get(); }
 
-  /// Adds @p change, everywhere, to what kernels are told at place @p constant of their constants
+  /// Adds @p change, everywhere, to what kernels are told at places @p places of their constants
   /// (Composition::constant_at), and to what follows from that; 0 ends it. Where parameters differ from place to place
-  /// nothing may follow from them. It ends set_step().
-  void change_parameter(PetscInt constant, PetscReal change);
+  /// nothing may follow from them. set_step() comes next.
+  void change_parameter(const std::vector<PetscInt> &places, PetscReal change);
 
   PetscReal row_scale(PetscInt field) const { return row_scale_[field]; }
   PetscReal modulus() const { return modulus_; } ///< tissue stiffness that scales the equations, kPa
@@ -157,7 +157,7 @@ private:
   std::vector<ISHandle> field_rows_; ///< global rows of each field that this rank owns
   Step step_;
   struct {
-    PetscInt constant = -1;
+    std::vector<PetscInt> places;
     PetscReal by = 0;
   } change_; ///< of a parameter
   PetscReal modulus_ = 1;

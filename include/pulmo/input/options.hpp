@@ -133,10 +133,12 @@ public:
   PetscErrorCode all_used(OptionList &list) const;
   /// The first half of it: pulmo's own.
   OptionList own_used() const;
-  /// A number that an option of pulmo's own gave, or left at its default, in a group that is in use.
+  /// A number that an option of pulmo's own gave, or left at its default, in a group that is in use. What it was read
+  /// into has to be there for as long as the options are.
   struct RealOption {
     std::string option, unit;
     PetscReal *target = nullptr;
+    std::vector<PetscReal *> copies; ///< what it was handed down to
   };
   std::vector<RealOption> real_options() const;
   /// What the run uses of the options of an effect.
@@ -190,6 +192,7 @@ private:
   std::vector<Declared> declared_;
   std::vector<Varying> varying_;
   std::map<std::string, std::string> content_;
+  std::map<const PetscReal *, std::vector<PetscReal *>> copies_; ///< hand_down()
   OptionList sources_;
   std::set<std::string> told_; ///< options of which warn_unused() has warned
 };

@@ -242,15 +242,18 @@ public:
     PetscCall(options.choice("direction", {"full", "normal", "current_normal"},
                              "what a spring resists: u, u . N, or u . n with the normal of the deformed surface",
                              direction_));
-    PetscCall(by_surface(options, {"stiffness", "kPa/mm", Range::not_negative(), "spring stiffness K_s per area", 0.08},
+    PetscCall(by_surface(options,
+                         {"stiffness", "kPa/mm", Range::not_negative(), "spring stiffness K_s per area", stiffness_},
                          parameters_.stiffness));
     PetscCall(by_surface(
-        options, {"stiffening", "1/mm", Range::not_negative(), "s: springs have the stiffness K_s (1 + s |u|)", 0},
+        options,
+        {"stiffening", "1/mm", Range::not_negative(), "s: springs have the stiffness K_s (1 + s |u|)", stiffening_},
         parameters_.stiffening));
-    PetscCall(by_surface(options,
-                         {"offset", "cmH2O", Range::any(),
-                          "pull of the wall where u = 0: outward (opens the lung), negative: it presses inward", 0},
-                         parameters_.offset));
+    PetscCall(
+        by_surface(options,
+                   {"offset", "cmH2O", Range::any(),
+                    "pull of the wall where u = 0: outward (opens the lung), negative: it presses inward", offset_},
+                   parameters_.offset));
     parameters_.direction = direction_ == "full" ? K::full : direction_ == "normal" ? K::normal : K::current_normal;
     PetscFunctionReturn(PETSC_SUCCESS);
   }
@@ -306,7 +309,7 @@ private:
     const char *unit;
     Range range;
     std::string help;
-    PetscReal common;
+    PetscReal &common;
   };
 
   /// Reads a number for all surfaces, and for each of them.
@@ -329,6 +332,7 @@ private:
   bool on_ = false;
   std::string direction_ = "full";
   std::vector<std::string> surfaces_{"pleura", "airway"};
+  PetscReal stiffness_ = 0.08, stiffening_ = 0, offset_ = 0; ///< of surfaces without a number of their own
   ChestWallKernels::Parameters parameters_{};
   std::array<bool, ChestWallKernels::max_surfaces> springs_{}, pulls_{}; ///< which surfaces have any
 };
