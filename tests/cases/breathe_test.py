@@ -185,6 +185,42 @@ class Mask(unittest.TestCase):
         self.assertTrue((case / "mesh.html").exists() and (case / "report.html").exists())
 
 
+class Ended(unittest.TestCase):
+    """A signal to tools/breathe alone ends what it has at work, too, in each stage; the case can be taken up again."""
+
+    def ended(self, number, stage, source, *words):
+        """The folder of a case that a signal ended while a program of a name was at work in it."""
+        place = folder()
+        process = subprocess.Popen([TOOL, *with_build([source, "--case", "c", *words])], cwd=place, env=pulmo.ENVIRONMENT, stdout=subprocess.PIPE,
+                                   stderr=subprocess.PIPE, text=True)
+
+        def at_work():
+            self.assertIsNone(process.poll(), stage)
+            children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+            return [int(child) for child in children if stage in Path(f"/proc/{child}/cmdline").read_text().split("\0")]
+
+        wait_for(at_work)
+        child, = at_work()
+        process.send_signal(number)
+        said = process.communicate(timeout=30)
+        self.assertEqual((process.returncode, "Traceback" in said[1]), (1, False), said)
+        self.assertIn("interrupted; tools/breathe c goes on", said[1])
+        self.assertFalse(Path(f"/proc/{child}").exists(), stage)
+        return place
+
+    def test_the_mesh_of_a_mask(self):
+        labels = np.zeros((90, 90, 120), np.uint8)
+        labels[5:40, 10:80, 10:110], labels[50:85, 10:80, 10:110] = 1, 2
+        place = folder()
+        nibabel.save(nibabel.Nifti1Image(labels, np.diag([2.0, 2, 2, 1])), place / "boxes.nii.gz")
+        self.assertFalse((self.ended(signal.SIGTERM, "--mask", place / "boxes.nii.gz", *QUICK) / "c/lung.msh").exists())
+
+    def test_a_check_and_a_dry_run(self):
+        self.ended(signal.SIGINT, "--check", LUNG, *QUICK)
+        place = self.ended(signal.SIGHUP, "-dry_run", LUNG, *QUICK, "--dry-run", "--", "-dry_run_seconds", "20")
+        self.assertTrue((place / "c/lung.msh").exists())
+
+
 class Within(unittest.TestCase):
     def test_the_run_takes_what_the_search_found(self):
         """The setting named by tools/accuracy_cost, though a step of the call's own scene is smaller."""

@@ -154,7 +154,10 @@ def begin(words):
 
 def main(words):
     try:
-        return make(words)
+        with stages.handled(stages.interrupt):
+            return make(words)
+    except KeyboardInterrupt:
+        sys.exit("\nbreathe: interrupted before anything was done")
     except OSError as error:
         fail(f"{error.filename or 'a file'} cannot be read or written ({error.strerror}); what was finished is kept")
 

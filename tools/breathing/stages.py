@@ -1,4 +1,5 @@
 """The stages of a case: mesh, accuracy, dry run, run, report. Each is left out where it was done already."""
+import contextlib
 import json
 import os
 import re
@@ -16,6 +17,8 @@ from .progress import Progress
 BUDGET = "30min"
 FOR_MASKS = ("volume", "size", "cells", "labels")  # options that go to tools/lung_mesh
 PULMO_STOPPED = 3  # exit code: there is a checkpoint to go on from
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+PATIENCE = 10  # s, for a program to end that was asked to
 
 
 def say(text):
@@ -27,14 +30,51 @@ def surroundings():
     return {name: value for name, value in environment().items() if not name.startswith("PETSC_OPTIONS")}
 
 
+@contextlib.contextmanager
+def handled(handler):
+    """The signals that end a program go to a handler, but for those that are ignored (nohup)."""
+    former = {s: signal.signal(s, handler) for s in SIGNALS if signal.getsignal(s) is not signal.SIG_IGN}
+    try:
+        yield
+    finally:
+        for s, one in former.items():
+            signal.signal(s, one)
+
+
+def interrupt(*_):
+    raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def started(command, **more):
+    """A program at work, in a group of its own. It ends with this one, whatever ends it, and so does what it started in its group."""
+    process = subprocess.Popen([str(word) for word in command], stdout=subprocess.PIPE, text=True, start_new_session=True, **more)
+    try:
+        yield process
+        process.wait()
+    except BaseException:
+        for number in (signal.SIGTERM, signal.SIGKILL):
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, number)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(PATIENCE)
+        raise
+
+
+def done(command, **more):
+    """What a program gives that has no long output (a CompletedProcess)."""
+    with started(command, stderr=subprocess.PIPE, **more) as process:
+        out, err = process.communicate()
+    return subprocess.CompletedProcess(command, process.returncode, out, err)
+
+
 def told(command, log, what, **place):
     """Runs a command, its words shown and kept; ends the program if it fails."""
-    with open(log, "w") as out:
-        process = subprocess.Popen([str(word) for word in command], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=surroundings(), **place)
+    with open(log, "w") as out, started(command, stderr=subprocess.STDOUT, env=surroundings(), **place) as process:
         for line in process.stdout:
             out.write(line)
             print("  " + line, end="", flush=True)
-    if process.wait():
+    if process.returncode:
         fail(f"{what} failed, see above")
 
 
@@ -48,7 +88,7 @@ def mesh(case, given):
     page = ["--report", case.folder / "mesh.html"]
     if given.source.suffix == ".msh":
         say(f"checking {given.source}")
-        check = subprocess.run([tool, "--check", given.source.resolve(), *map(str, page)], capture_output=True, text=True, env=environment())
+        check = done([tool, "--check", given.source.resolve(), *page], env=environment())
         log.write_text(check.stdout + check.stderr)
         print("".join(f"  {line}\n" for line in (check.stdout + check.stderr).splitlines()), end="")
         if check.returncode:
@@ -103,14 +143,14 @@ def dry_run(case, given, ranks):
         return
     begun = time.monotonic()
     log = case.folder / "dry_run.txt"
-    run = subprocess.run([*launched(given, ranks), *case.options, "-dry_run"], cwd=case.folder, env=surroundings(), capture_output=True, text=True)
+    run = done([*launched(given, ranks), *case.options, "-dry_run"], cwd=case.folder, env=surroundings())
     log.write_text(run.stdout + run.stderr)
     print(run.stdout, end="")
     if run.returncode:  # without what the launcher has to say
         errors = [line for line in run.stderr.splitlines() if line.startswith("pulmo: error")]
         print("\n".join(errors) or f"breathe: error: pulmo ended with code {run.returncode}; {log} has all that it said", file=sys.stderr)
         sys.exit(run.returncode)
-    version = subprocess.run([given.build / "pulmo", "-version"], capture_output=True, text=True, env=environment()).stdout.strip()
+    version = done([given.build / "pulmo", "-version"], env=environment()).stdout.strip()
     case.save(dry_run={"seconds": round(time.monotonic() - begun, 1), "inputs": inputs, "version": version})
 
 
@@ -150,10 +190,8 @@ def run(case, given, ranks):
 def execute(command, case):
     """Runs pulmo with a bar; what it prints goes to pulmo.log. A signal is passed on, so that pulmo leaves a checkpoint."""
     progress = Progress()
-    with open(case.folder / "pulmo.log", "a") as log:
-        process = subprocess.Popen(command, cwd=case.folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=surroundings(),
-                                   start_new_session=True)
-        former = {s: signal.signal(s, lambda number, _: process.send_signal(number)) for s in (signal.SIGINT, signal.SIGTERM)}
+    with open(case.folder / "pulmo.log", "a") as log, started(command, cwd=case.folder, stderr=subprocess.STDOUT, env=surroundings()) as process, \
+            handled(lambda number, _: process.send_signal(signal.SIGTERM if number == signal.SIGHUP else number)):
         try:
             for line in process.stdout:
                 log.write(line)
@@ -162,8 +200,6 @@ def execute(command, case):
             return process.wait()
         finally:
             progress.end()
-            for s, handler in former.items():
-                signal.signal(s, handler)
 
 
 def report(case):
@@ -172,7 +208,7 @@ def report(case):
     if not any((folder / name).exists() for name in ("signals.csv", "signals.csv.part")):
         return
     begun = time.monotonic()
-    made = subprocess.run([SOURCE / "tools/report", folder, "--output", case.folder / "report.html"], capture_output=True, text=True, env=environment())
+    made = done([SOURCE / "tools/report", folder, "--output", case.folder / "report.html"], env=environment())
     if made.returncode:
         sys.stderr.write(made.stderr)
         fail("tools/report failed, see above")

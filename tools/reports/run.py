@@ -22,10 +22,19 @@ class Run(RunFiles):
         return fields.Fields(self.directory)
 
 
+def name_of(directory):
+    """Its last folder; of the run of a case of tools/breathe that of the case."""
+    folder, last = os.path.split(os.path.abspath(directory))
+    if os.path.isfile(os.path.join(folder, "case.json")):
+        case = os.path.basename(folder)
+        return case if last == "run" else f"{case}, {last}"
+    return last
+
+
 def load(directories):
-    """Runs with names that differ: the last folder, or the path as it was given."""
+    """Runs with names that differ: the last folder (of a case of tools/breathe the case's), or the path as it was given."""
     directories = [os.fspath(d) for d in directories]
-    last = [os.path.basename(os.path.abspath(d)) for d in directories]
+    last = [name_of(d) for d in directories]
     if len(set(map(os.path.abspath, directories))) < len(directories):
         fail("a directory is named twice")
     return [Run(d, name if last.count(name) == 1 else d, i, len(last)) for i, (d, name) in enumerate(zip(directories, last))]
