@@ -81,6 +81,7 @@ class Mesh(unittest.TestCase):
     def test_the_folder_is_whole(self):
         """It goes elsewhere, without the files that the call named, and run.sh does the same run."""
         self.assertTrue((self.case / "report.html").stat().st_size > 10000)
+        self.assertIn("<title>pulmo: case</title>", (self.case / "report.html").read_text())
         self.assertIn("The mesh lung.msh has 1350 ml", (self.case / "dry_run.txt").read_text())
         elsewhere = Path(pulmo.scratch()) / "moved"
         shutil.copytree(self.case, elsewhere)
