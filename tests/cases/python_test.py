@@ -79,6 +79,12 @@ class Module(unittest.TestCase):
         with self.assertRaisesRegex(pulmo.Missing, "energy_audit off"):
             other.energy
 
+    def test_a_run_without_a_whole_breath(self):
+        run = pulmo.run("pcv", "lung_test", ts_max_time=0.4, **FAST)
+        self.assertEqual(list(run.breaths.columns), list(self.run_.breaths.columns))
+        self.assertEqual(set(run.numbers.index), set(self.run_.numbers.index))
+        self.assertEqual(list(run.numbers.dropna().index), ["functional_residual_capacity_ml"])
+
     def test_ranks(self):
         with mock.patch.dict(os.environ, case.ENVIRONMENT):
             run = pulmo.run("pcv", "lung_test", ranks=2, ts_max_time=0.4, **FAST)

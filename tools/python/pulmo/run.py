@@ -4,6 +4,8 @@ import functools
 from .files import RunFiles
 from .tables import pandas
 
+GROUPS = ("energy_j", "inspiratory_energy_j", "fit_until_cut")  # of numbers, also where a breath that was cut has none in them
+
 
 class Run:
     """What a run left in its directory; tables are read when they are asked for.
@@ -35,7 +37,7 @@ class Run:
     @functools.cached_property
     def breaths(self):
         """DataFrame of the clinical numbers, a row for each breath, numbered from 1; NaN where a breath does not define one."""
-        rows = [{key: value for key, value in breath.items() if not isinstance(value, (dict, list))}
+        rows = [{key: value for key, value in breath.items() if key not in GROUPS and not isinstance(value, (dict, list))}
                 for breath in self.summary.get("breaths") or []]
         table = pandas().DataFrame(rows, index=pandas().RangeIndex(1, len(rows) + 1, name="breath"))
         return table.astype({name: float for name in table.columns if name != "complete"})
