@@ -143,6 +143,53 @@ class Module(unittest.TestCase):
             self.assertEqual(table["tidal_volume_ml"][row], run.summary["tidal_volume_ml"])
             self.assertEqual(run.numbers["peak_inspiratory_pressure_cmH2O"], table["ventilator_pip"][row])
 
+    def test_a_sweep_is_taken_up(self):
+        """What is done is not done again, what was cut off begins anew; a changed one is refused, and so are folders of the user's own."""
+        where, mesh = case.scratch("sweep"), case.scratch("mine.msh")
+        shutil.copyfile(case.mesh("lung_test.msh"), mesh)
+        values, rest = {"ventilator_pip": [6, 8], "snes_max_it": [20, 1]}, dict(ts_max_time=0.4, directory=where, **FAST)
+        real, calls = subprocess.run, []
+
+        def run(words, **more):
+            if "-output_dir" in words:  # Python's own modules start programs, too
+                calls.append(words)
+            if len(calls) == 3 and not os.path.exists(calls[2][-1]):  # cut off at work
+                os.makedirs(words[-1])
+                shutil.copyfile(os.path.join(where, "run_001/signals.csv"), os.path.join(words[-1], "signals.csv.part"))
+                raise KeyboardInterrupt
+            return real(words, **more)
+
+        with mock.patch.object(subprocess, "run", run):
+            with self.assertRaises(KeyboardInterrupt):
+                pulmo.sweep(values, "pcv", mesh, **rest)
+            table = pulmo.sweep(values, "pcv", mesh, **rest)
+            self.assertEqual([os.path.basename(words[-1]) for words in calls[3:]], ["run_003", "run_004"])
+            again = pulmo.sweep(values, "pcv", mesh, **rest)
+            self.assertEqual(len(calls), 5)
+            self.assertTrue(again.equals(table))
+            self.assertEqual(list(table["failure"] == ""), [True, False, True, False])
+            for other, more, said in (({"ventilator_pip": [6]} | {"snes_max_it": [20, 1]}, {}, "had 4 runs, and this one has 2"),
+                                      (values | {"ventilator_pip": [6, 9]}, {}, "-ventilator_pip 8 where this one has -ventilator_pip 9"),
+                                      (values, {"tissue": "ma"}, "-tissue ma")):
+                with self.assertRaisesRegex(pulmo.PulmoError, said):
+                    pulmo.sweep(other, "pcv", mesh, **rest | more)
+            with open(mesh, "a") as f:
+                f.write("\n")
+            with self.assertRaisesRegex(pulmo.PulmoError, "mine.msh has changed since"):
+                pulmo.sweep(values, "pcv", mesh, **rest)
+            shutil.copyfile(case.mesh("lung_test.msh"), mesh)
+            shutil.rmtree(os.path.join(where, "run_001"))
+            pulmo.sweep(values, "pcv", mesh, **rest)
+            self.assertEqual([os.path.basename(words[-1]) for words in calls[5:]], ["run_001"])
+        own = case.scratch("own")
+        shutil.copytree(self.case.directory, os.path.join(own, "run_001"))
+        with self.assertRaisesRegex(pulmo.RunFailed, "output_overwrite"):
+            pulmo.sweep(values, "pcv", mesh, **rest | {"directory": own})
+        with open(os.path.join(where, "sweep.json"), "w") as f:
+            f.write("[")
+        with self.assertRaisesRegex(pulmo.PulmoError, "sweep.json is damaged"):
+            pulmo.sweep(values, "pcv", mesh, **rest)
+
     def test_a_run_at_work(self):
         folder = case.scratch("work")
         shutil.copytree(self.case.directory, folder)

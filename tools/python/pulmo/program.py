@@ -1,6 +1,9 @@
 """Runs the program and varies its options."""
 import atexit
+import contextlib
+import hashlib
 import itertools
+import json
 import os
 import re
 import shutil
@@ -107,11 +110,94 @@ def run(scene, mesh, *, solver="iterative", ranks=1, directory=None, **options):
     return Run(directory, done.stdout)
 
 
+def _contents(words, known):
+    """{path: hash of what is in it} of the files that words of a command or of an option file name, those in option files with them."""
+    for word in words:
+        if word not in known and os.path.isfile(word):
+            with open(word, "rb") as file:
+                known[word] = hashlib.file_digest(file, "sha256").hexdigest()
+            if word.endswith(".opts"):
+                _contents(Path(word).read_text(errors="replace").split(), known)
+    return known
+
+
+class _Record:
+    """sweep.json in the directory of a sweep: what it was asked for, and how the runs ended that need not be made again.
+
+    `ended`: {run: "" or why it could not go on}.
+    """
+
+    def __init__(self, directory, commands, again):
+        directory = os.fspath(directory)
+        self.path = os.path.join(directory, "sweep.json")
+        files = {}
+        for words in commands:
+            _contents(words, files)
+        self.asked = {"commands": commands, "files": files}
+        self.ended, self.begun = {}, []
+        if not os.path.exists(self.path):
+            return
+        try:
+            with open(self.path) as file:
+                known = json.load(file)
+            asked, ended, self.begun = known["asked"], dict(known["ended"]), list(known["begun"])
+            change = self._change(asked)
+        except (ValueError, KeyError, TypeError, OSError) as error:
+            raise PulmoError(f"sweep: {self.path} is damaged ({error}): name another directory") from None
+        if change and not again:
+            raise PulmoError(f"sweep: {directory} holds the runs of another sweep: {change}; name another directory, or call it as it was")
+        if not again:
+            self.ended = ended
+
+    def _change(self, asked):
+        """What is not as it was, in words; "" if nothing."""
+        before, now = asked["commands"], self.asked["commands"]
+        for old, new in zip(before, now):
+            if old != new:
+                at = next((i for i, (a, b) in enumerate(zip(old, new)) if a != b), min(len(old), len(new)))
+                at -= at > 0 and at < len(new) and not new[at].startswith("-")
+                return f"it had {' '.join(old[at:at + 2]) or 'nothing'} where this one has {' '.join(new[at:at + 2]) or 'nothing'}"
+        if len(before) != len(now):
+            return f"it had {len(before)} runs, and this one has {len(now)}"
+        changed = sorted(name for name in asked["files"].keys() | self.asked["files"].keys() if asked["files"].get(name) != self.asked["files"].get(name))
+        return f"{changed[0]} has changed since" if changed else ""
+
+    def made(self, name):
+        """The Run of a name that need not be made again; None if there is none."""
+        if name in self.ended:
+            with contextlib.suppress(PulmoError):
+                run = Run(os.path.join(os.path.dirname(self.path), name))
+                if run.state == ("failed" if self.ended[name] else "finished"):
+                    return run
+        self.ended.pop(name, None)
+        return None
+
+    def ours(self, name):
+        """Whether the sweep has begun a run here before. Notes that it does now."""
+        before = name in self.begun
+        if not before:
+            self.begun.append(name)
+            self._write()
+        return before
+
+    def note(self, name, failure):
+        self.ended[name] = failure
+        self._write()
+
+    def _write(self):
+        os.makedirs(os.path.dirname(self.path) or ".", exist_ok=True)
+        part = f"{self.path}.{os.getpid()}.part"
+        with open(part, "w") as file:
+            json.dump({"asked": self.asked, "begun": self.begun, "ended": self.ended}, file, indent=1)
+        os.replace(part, self.path)
+
+
 def sweep(values, scene, mesh, *, directory=None, **arguments):
     """Runs all combinations of some values, one after the other, and returns a DataFrame: a row for each run.
 
     values: {name of an option without its dash: list of values}. directory: folder for the runs, one folder for each (run_001, ...);
-    None: they go away when Python ends. All else as in run().
+    None: they go away when Python ends. All else as in run(). Called again with a directory, the same sweep keeps the runs that came to
+    their end there, or could not go on, and makes the others; a sweep that is not the same is refused.
 
     Columns: the options that vary, the overall clinical numbers (Run.numbers), `directory`, and `failure`: "" or why that run did
     not reach its end; its numbers are NaN then, and the others go on. A combination that is wrong input raises RunFailed at once.
@@ -128,16 +214,27 @@ def sweep(values, scene, mesh, *, directory=None, **arguments):
     both = sorted(set(values) & set(arguments))
     if both:
         raise PulmoError(f"sweep: {both[0]} is both varied and given")
+    combinations = [dict(zip(values, combination)) for combination in itertools.product(*values.values())]
+    again = arguments.get("output_overwrite") not in (None, False, "off")  # all of it, and as the caller says
+    record = _Record(directory, [command(scene, mesh, **arguments | chosen) for chosen in combinations], again) if directory else None
     rows = []
-    for number, combination in enumerate(itertools.product(*values.values()), 1):
-        chosen = dict(zip(values, combination))
-        where = os.path.join(os.fspath(directory), f"run_{number:03d}") if directory else _new_directory()
+    for number, chosen in enumerate(combinations, 1):
+        name = f"run_{number:03d}"
+        where = os.path.join(os.fspath(directory), name) if directory else _new_directory()
+        made = record and record.made(name)
+        more = {"output_overwrite": True} if record and record.ours(name) and not again else {}
         try:
-            numbers, failure = dict(run(scene, mesh, directory=where, **arguments | chosen).numbers), ""
+            failure = "" if not made else record.ended[name]
+            numbers = {} if failure else dict((made or run(scene, mesh, directory=where, **arguments | chosen | more)).numbers)
         except RunFailed as error:
             if error.code == 1:
                 raise
             numbers, failure = {}, str(error)
+            if record and error.code == 2:  # it would fail again
+                record.note(name, failure)
+        else:
+            if record:
+                record.note(name, failure)
         rows.append(chosen | numbers | {"directory": where, "failure": failure})
     table = pandas().DataFrame(rows)
     return table[[name for name in table.columns if name not in ("directory", "failure")] + ["directory", "failure"]]
