@@ -238,6 +238,22 @@ class Runs(unittest.TestCase):
         run.signals["p"] = [0, 1, 2, 3, 4, 5, 6, 7]
         self.assertEqual(charts.jumps(run, "p"), [])
 
+    def test_peep_trial(self):
+        """A row for each level; with several regions, columns of theirs."""
+        run = pulmo.finished(pulmo.DIRECT + pulmo.options_file("scenes/peep_trial.opts") + pulmo.LUNG + ["-elements", "P1-P1", "-ts_dt", "0.5"])
+        levels = run.json()["peep_trial"]["levels"]
+        self.assertIn("open_share", levels[0]["regions"]["right_lung"])
+        heads, *rows = Page(written(run.directory)).table("PEEP trial")
+        self.assertEqual(heads[:4], ["PEEP (cmH2O)", "Breath", "Compliance (ml/cmH2O)", "End expiratory volume (ml)"])
+        self.assertEqual([number(row[0]) for row in rows], [level["peep_cmH2O"] for level in levels])
+        for row, level in zip(rows, levels):
+            self.assertAlmostEqual(number(row[heads.index("Open share")]), level["open_share"], delta=1e-4)
+            self.assertAlmostEqual(number(row[2]) / level["compliance_ml_per_cmH2O"], 1, delta=1e-4)
+        levels[0]["regions"]["left_lung"] = {"open_share": 0.25}
+        told = sections.breaths.peep_trial({"levels": levels})
+        self.assertEqual(told["rows"][0][told["heads"].index("Open share, left_lung")], "0.25")
+        self.assertEqual(told["rows"][1][told["heads"].index("Open share, left_lung")], "–")
+
     def test_a_failed_run_and_one_at_work_say_so_first(self):
         for state, words in (("failed", "failed"), ("unfinished", "not finished")):
             with self.subTest(state=state):
