@@ -393,6 +393,8 @@ class Runs(unittest.TestCase):
             self.assertEqual(len(ids), len(set(ids)))
             for element in shown.all("a"):
                 self.assertIn(element["href"][1:], ids)
+            for element in shown.all("code"):  # a browser breaks a line behind a dash, unless it is the line's first
+                self.assertTrue("td" not in element["within"] or "td code { display: block; }" in text)
             self.assertEqual({e["tag"] for e in shown.all("header", "nav", "main", "footer")}, {"header", "nav", "main", "footer"})
 
 
