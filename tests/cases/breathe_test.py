@@ -139,6 +139,17 @@ class Mesh(unittest.TestCase):
         options = json.loads((place / "c2/run/summary.json").read_text())["options"]
         self.assertEqual([options[name] for name in ("-tissue", "-ventilator_pip", "-chest_wall_stiffness", "-ts_max_time")], ["ma", "5", "0.1", "0.2"])
 
+    def test_scenes_with_a_mesh_of_their_own(self):
+        """The mesh of the call counts."""
+        place = folder()
+        made = called(LUNG, "--mode", "ards_peep_trial", *QUICK, "--case", "c", "--", "-ts_max_time", "0.1", "-dm_plex_filename", "x.msh", cwd=place)
+        self.assertEqual((made.returncode, "-dm_plex_filename is given" in made.stderr), (1, True), made.stderr)
+        made = called(LUNG, "--mode", "peep_trial", *QUICK, "--case", "c", "--", "-ts_max_time", "0.2", cwd=place)
+        self.assertEqual(made.returncode, 0, made.stdout + made.stderr)
+        self.assertIn("peep_trial.opts names the mesh meshes/lung_test.msh; the one of the call counts", made.stdout)
+        self.assertEqual(json.loads((place / "c/run/summary.json").read_text())["options"]["-dm_plex_filename"], "lung.msh")
+        self.assertTrue((place / "c/inputs/peep_trial.txt").exists())
+
     def test_overwriting_leaves_the_users_files(self):
         place = folder()
         shutil.copytree(self.place, place, dirs_exist_ok=True)

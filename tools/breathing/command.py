@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 
 from shared.common import SCENES, SOLVERS, SOURCE, fail, listed, offered, require
-from shared.keys import lock
+from shared.keys import LOCK, lock
 
 from . import stages
 from .case import Case, digest_of_source
@@ -144,7 +144,7 @@ def begin(words):
     folder = given.case or Path("results") / f"{stem(given.source)}-{mode}"
     if folder.exists() and not folder.is_dir():
         fail(f"--case {folder} is a file: name a folder")
-    if folder.exists() and not (folder / "case.json").exists() and any(folder.iterdir()):
+    if folder.exists() and not (folder / "case.json").exists() and any(path.name != LOCK for path in folder.iterdir()):
         fail(f"--case {folder} holds other files: name a new folder")
     lock(folder)
     places = {given.source, given.build}

@@ -100,13 +100,16 @@ def digest(words, environment=None, directory=""):
     return content.hexdigest()[:16]
 
 
+LOCK = ".lock"  # all that a call leaves in a folder which is refused then
+
+
 def lock(folder):
     """Keeps other calls out of a folder until this process ends; ends the program if another one is at work there."""
     folder = Path(folder).resolve()
     if folder in _held:
         return
     folder.mkdir(parents=True, exist_ok=True)
-    file = open(folder / ".lock", "a+")
+    file = open(folder / LOCK, "a+")
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
