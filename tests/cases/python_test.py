@@ -118,6 +118,29 @@ class Module(unittest.TestCase):
             with self.assertRaisesRegex(pulmo.PulmoError, words):
                 call()
 
+    def test_scenes_with_a_mesh_and_files_of_their_own(self):
+        """The mesh of the call counts, and files are found from any folder; what the call names itself counts most."""
+        rest = FAST | dict(ts_max_time=0.2)
+        for place in (case.SOURCE, case.scratch("elsewhere")):
+            os.makedirs(place, exist_ok=True)
+            with contextlib.chdir(place):
+                used = pulmo.run("peep_trial", "lung_pair", **rest).summary
+                self.assertEqual(used["options"]["-dm_plex_filename"], case.mesh("lung_pair.msh"))
+                self.assertAlmostEqual(used["reference_volume_ml"], 2600, delta=1)
+                programme = case.programme("inspiration 0.2 pressure 5\n")[-1]
+                used = pulmo.run("peep_trial", "lung_test", ventilator_programme=programme, **rest).summary
+                self.assertEqual(used["options"]["-ventilator_programme"], programme)
+
+    def test_arguments_of_numpy_and_wrong_ones(self):
+        self.assertEqual(pulmo.run("pcv", "lung_test", ranks=np.int64(1), ts_max_time=np.float64(0.2), **FAST).state, "finished")
+        fields = self.run_.fields
+        np.testing.assert_array_equal(fields.values("J_mean", np.int64(-1)), fields.values("J_mean", -1))
+        for wrong in (99, -99, 1.5, "last"):
+            with self.assertRaisesRegex(pulmo.PulmoError, f"no snapshot '?{wrong}"):
+                fields.values("J_mean", wrong)
+        with self.assertRaisesRegex(pulmo.PulmoError, "sweep.json cannot be written"):
+            pulmo.sweep({"ventilator_pip": [6]}, "pcv", "lung_test", directory=os.path.join(self.case.directory, "signals.csv"), **FAST)
+
     def test_a_cut_file_is_no_run(self):
         """One that ends before the summary does, and one that is no object."""
         cut = case.scratch("cut")

@@ -47,6 +47,22 @@ def _file(name, folder, ending, what):
     return str(path)
 
 
+def _files_named(option_files):
+    """Words for options of files that name a file from pulmo's top folder, as its scenes do, where it is not there from here."""
+    named = {}
+    for path in option_files:
+        for line in Path(path).read_text(errors="replace").splitlines():
+            found = re.match(r"\s*(-[A-Za-z_]\S*)\s*(.*?)\s*(?:(?<=\s)#.*)?$", line)
+            if found:
+                named[found[1]] = found[2]
+    words = []
+    for name, value in named.items():
+        for file, rest in ((value, ""), (value.rpartition(":")[0], ":" + value.rpartition(":")[2])):
+            if "/" in file and name != "-dm_plex_filename" and not os.path.exists(file) and (SOURCE / file).is_file():
+                words += [name, str(SOURCE / file) + rest]
+    return words
+
+
 def _words(options):
     """Words of the command line for {name: value}: True and False are on and off, None leaves an option out, lists get commas."""
     words = []
@@ -82,12 +98,14 @@ def command(scene, mesh, solver="iterative", ranks=1, directory=None, **options)
     scenes = [scene] if isinstance(scene, (str, os.PathLike)) else list(scene or [])
     if not scenes or not isinstance(mesh, (str, os.PathLike)):
         raise PulmoError("a run needs a scene (a name, a file or a list of them) and a mesh (a name or a file)")
-    if isinstance(ranks, bool) or not isinstance(ranks, int) or ranks < 1:
+    if isinstance(ranks, bool) or not hasattr(ranks, "__index__") or ranks < 1:
         raise PulmoError(f"ranks is the number of processes, 1 or more, not {ranks!r}")
     words = ["mpiexec", "-n", str(ranks)] if ranks > 1 else []
-    words += [_program(), "-dm_plex_filename", _file(mesh, "meshes", ".msh", "mesh")]
-    for name, folder, what in [(solver, "solvers", "solver")] + [(name, "scenes", "scene") for name in scenes]:
-        words += ["-options_file", _file(name, "petsc_options/" + folder, ".opts", what)]
+    files = [_file(name, "petsc_options/" + folder, ".opts", what)
+             for name, folder, what in [(solver, "solvers", "solver")] + [(name, "scenes", "scene") for name in scenes]]
+    words += [_program(), *(word for file in files for word in ("-options_file", file))]
+    # the mesh after the scenes, some of which name one of their own
+    words += [*_files_named(files), "-dm_plex_filename", _file(mesh, "meshes", ".msh", "mesh")]
     return words + _words(options) + (["-output_dir", os.fspath(directory)] if directory else [])
 
 
@@ -185,11 +203,14 @@ class _Record:
         self._write()
 
     def _write(self):
-        os.makedirs(os.path.dirname(self.path) or ".", exist_ok=True)
         part = f"{self.path}.{os.getpid()}.part"
-        with open(part, "w") as file:
-            json.dump({"asked": self.asked, "begun": self.begun, "ended": self.ended}, file, indent=1)
-        os.replace(part, self.path)
+        try:
+            os.makedirs(os.path.dirname(self.path) or ".", exist_ok=True)
+            with open(part, "w") as file:
+                json.dump({"asked": self.asked, "begun": self.begun, "ended": self.ended}, file, indent=1)
+            os.replace(part, self.path)
+        except OSError as error:
+            raise PulmoError(f"sweep: {self.path} cannot be written ({error.strerror}); choose another directory or free the disk") from None
 
 
 def sweep(values, scene, mesh, *, directory=None, **arguments):

@@ -6,7 +6,7 @@ import xml.etree.ElementTree as ElementTree
 import h5py
 import numpy as np
 
-from .errors import Missing
+from .errors import Missing, PulmoError
 
 
 def numbering(points, cells, of_points, of_cells):
@@ -81,6 +81,8 @@ class Snapshots:
     def values(self, name, snapshot):
         """A field at a snapshot (its number, -1 the last), numbered as `points` or `cells` are: (n,), (n, 3) or (m,); None if
         the run has no such field."""
+        if not hasattr(snapshot, "__index__") or not -len(self.times) <= snapshot < len(self.times):
+            raise PulmoError(f"there is no snapshot {snapshot!r}: the run has {len(self.times)}, numbered from 0 (times: their s)")
         where = self._where[snapshot].get(name)
         if where is None:
             return None
