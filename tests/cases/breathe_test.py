@@ -150,6 +150,12 @@ class Mesh(unittest.TestCase):
         self.assertEqual(json.loads((place / "c/run/summary.json").read_text())["options"]["-dm_plex_filename"], "lung.msh")
         self.assertTrue((place / "c/inputs/peep_trial.txt").exists())
 
+    def test_more_ranks_than_cores_are_told(self):
+        cores = len(os.sched_getaffinity(0))
+        made = called(LUNG, "--elements", "P1-P1", "--ranks", str(cores + 1), "--dry-run", *STEPS, "-dry_run_seconds", "1")
+        self.assertEqual(made.returncode, 0, made.stderr)
+        self.assertIn(f"--ranks {cores + 1} is more than the {cores} core", made.stdout)
+
     def test_overwriting_leaves_the_users_files(self):
         place = folder()
         shutil.copytree(self.place, place, dirs_exist_ok=True)

@@ -10,6 +10,7 @@ run, report. All of it goes into one folder, --case, which also holds the option
 after --; they count in the end.
 """
 import argparse
+import os
 import shlex
 import sys
 from pathlib import Path
@@ -171,6 +172,9 @@ def make(words):
         if given.within:
             stages.accuracy(case, given)
         ranks = given.ranks or stages.ranks_for(case, CELLS_FOR_A_RANK)
+        cores = len(os.sched_getaffinity(0))
+        if ranks > cores:
+            stages.say(f"--ranks {ranks} is more than the {cores} core{'s' * (cores > 1)} at hand: they wait for each other, and memory grows with them")
         stages.dry_run(case, given, ranks)
         if only_dry:
             print(f"breathe: that was the dry run; {shlex.join(['tools/breathe', str(case.folder)])} goes on")
