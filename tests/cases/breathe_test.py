@@ -244,10 +244,10 @@ class Within(unittest.TestCase):
         """The setting named by tools/accuracy_cost, though a step of the call's own scene is smaller."""
         place = folder()
         made = called(os.path.join(pulmo.SOURCE, "meshes/cube_lung.msh"), "--case", "c", *QUICK, "--within", "C_rs=20%", "--budget", "5min", "--",
-                      "-mesh_scale", "10", cwd=place)
+                      "-mesh_scale", "10", "-ts_dt", "0.01", cwd=place)
         self.assertEqual(made.returncode, 0, made.stdout + made.stderr)
         found = re.search(r"backward Euler ([\d.]+) s", re.search(r"\*\*C_rs within 20 %\*\*: (.*)", made.stdout)[1])
-        self.assertGreater(float(found[1]), 0.05)
+        self.assertGreater(float(found[1]), 0.01)
         summary = json.loads((place / "c/run/summary.json").read_text())
         self.assertEqual(float(summary["options"]["-ts_dt"]), float(found[1]))
 
@@ -264,7 +264,7 @@ class Mistakes(unittest.TestCase):
 
     def test_words(self):
         for words, said in ((["none.msh"], "there is no none.msh"), ([LUNG, "--mode", "pvc"], "pcv"), ([LUNG, "--effects", "gravty"], "gravity"),
-                            ([LUNG, "--volume", "2500ml"], "--volume"), ([LUNG, "--ranks", "0"], "--ranks"), ([LUNG, "--solver", "x"], "iterative"),
+                            ([LUNG, "--volume", "2500ml"], "--volume"), ([LUNG, "--ranks", "0"], "--ranks"), ([LUNG, "--ranks", "100000", *QUICK[:2]], "--ranks 100000"), ([LUNG, "--solver", "x"], "iterative"),
                             ([LUNG, "--pip"], "--pip"), ([__file__], "label image"), ([LUNG, "--build", "nowhere"], "tools/setup"),
                             ([LUNG, "--", "tissue"], "belongs to no option"), ([LUNG, "--", "-output_dir", "x"], "-output_dir"), ([LUNG, "--", "-options_file", "no.opts"], "no.opts")):
             with self.subTest(words=words):

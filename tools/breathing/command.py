@@ -23,6 +23,7 @@ from .case import Case, digest_of_source
 
 NUMBERS = {"tidal_volume": "ml", "pip": "cmH2O", "peep": "cmH2O", "inspiration": "s", "expiration": "s", "breaths": ""}
 CELLS_FOR_A_RANK = 4000  # fewer cells are not worth a second process
+MOST_PER_CORE = 32  # processes: they wait for each other, and memory grows with them
 
 
 class Parser(argparse.ArgumentParser):
@@ -62,6 +63,8 @@ def parse(words):
     given.flags = words[cut + 1:]
     if given.ranks is not None and given.ranks < 1:
         fail("--ranks must be at least 1")
+    if given.ranks and given.ranks > MOST_PER_CORE * len(os.sched_getaffinity(0)):
+        fail(f"--ranks {given.ranks} is more than {MOST_PER_CORE} for each of the {len(os.sched_getaffinity(0))} cores at hand, which would stop the machine; lower it")
     if given.budget and not given.within:
         fail("--budget limits the search of --within: give both, or neither")
     return given
