@@ -162,9 +162,9 @@ private:
 /// What a run was watched by, and what is known of its errors.
 struct Audits {
   const RegionAudit &regions;
-  const EnergyAudit *energy;             ///< null with -energy_audit off
-  const GravityAudit *gravity = nullptr; ///< null without gravity
-  const ErrorReport *errors = nullptr;   ///< null before the estimate, or without -error_estimate
+  const EnergyAudit *energy;                        ///< null with -energy_audit off
+  const GravityAudit *gravity = nullptr;            ///< null without gravity
+  const ErrorReport *errors = nullptr;              ///< null before the estimate, or without -error_estimate
   const SensitivityReport *sensitivities = nullptr; ///< null before the sweep, or without -sensitivities
 };
 
