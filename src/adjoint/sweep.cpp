@@ -41,7 +41,7 @@ PetscErrorCode Sweep::setup()
   PetscFunctionBeginUser;
   PetscCall(DMGetNumFields(model_.dm(), &fields));
   gas_ = fields > pressure;
-  for (VecHandle *v : {&x_, &rate_, &past_, &column_, &work_, &other_}) PetscCall(create(*v));
+  for (VecHandle *v : {&x_, &rate_, &past_, &column_, &border_, &work_, &other_}) PetscCall(create(*v));
   for (VecHandle *v : {&right_, &held_, &product_}) PetscCall(DMCreateGlobalVector(model_.dm(), v->out()));
   volumes_.assign(trajectory_.stages().size(), 0);
   flows_ = volumes_;
@@ -64,7 +64,9 @@ PetscErrorCode Sweep::setup()
 
 Sweep::Wanted &Sweep::wanted(Pending &pending, PetscInt stage, std::size_t functional) const
 {
-  return pending[stage][functional];
+  std::vector<Wanted> &all = pending[stage];
+  all.resize(count_);
+  return all[functional];
 }
 
 void Sweep::want_ventilator_pressure(PetscInt stage, PetscReal derivative, Wanted &wanted) const
@@ -146,18 +148,14 @@ PetscErrorCode Sweep::dot(Vec a, Vec b, PetscReal &sum) const
 
 PetscErrorCode Sweep::solve(Vec right, Vec solution, std::string &failure)
 {
-  SNES snes;
-  KSP ksp;
   KSPConvergedReason reason;
   PetscInt iterations;
 
   PetscFunctionBeginUser;
-  PetscCall(TSGetSNES(simulation_.ts(), &snes));
-  PetscCall(SNESGetKSP(snes, &ksp));
   PetscCall(VecZeroEntries(solution)); // with -ksp_initial_guess_nonzero it is one
-  PetscCall(KSPSolve(ksp, right, solution));
-  PetscCall(KSPGetConvergedReason(ksp, &reason));
-  PetscCall(KSPGetIterationNumber(ksp, &iterations));
+  PetscCall(KSPSolve(ksp_, right, solution));
+  PetscCall(KSPGetConvergedReason(ksp_, &reason));
+  PetscCall(KSPGetIterationNumber(ksp_, &iterations));
   ++solves_;
   krylov_ += iterations;
   if (reason < 0)
@@ -222,165 +220,187 @@ PetscErrorCode Sweep::look_back(const StageRecord &record, Vec z, std::size_t fu
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+/// Adds what the numbers want of the row that a stage ends.
+void Sweep::want_row(const std::vector<Functional> &functionals, PetscInt stage, Pending &pending) const
+{
+  const PetscInt number = trajectory_.stages()[static_cast<std::size_t>(stage)].row;
+  if (number < 0) return;
+  const auto row = static_cast<std::size_t>(number);
+  for (std::size_t k = 0; k < functionals.size(); ++k) {
+    const Functional &f = functionals[k];
+    if (f.by_volume[row] == 0 && f.by_pressure[row] == 0 && f.by_flow[row] == 0) continue;
+    Wanted &w = wanted(pending, stage, k);
+    w.volume += f.by_volume[row] / units::mm3_per_ml;
+    w.flow += f.by_flow[row] / units::mm3_per_ml;
+    want_ventilator_pressure(stage, f.by_pressure[row] / units::kPa_per_cmH2O, w);
+  }
+}
+
+/// Fills the matrix with the transposed Jacobian of a stage, no row closed.
+PetscErrorCode Sweep::assemble(const StageRecord &record, PetscInt number)
+{
+  const Mat matrix = simulation_.matrix();
+  SNES snes;
+  PetscInt lag;
+
+  PetscFunctionBeginUser;
+  PetscCall(recall(record, number));
+  PetscCall(make_column(record));
+  PetscCall(model_.transposed_jacobian(record.time, x_, rate_, record.stage.slope, matrix));
+  PetscCall(KSPSetOperators(ksp_, matrix, matrix));
+  // a preconditioner is kept as long as that of a Jacobian is, for stages of one kind
+  PetscCall(TSGetSNES(simulation_.ts(), &snes));
+  PetscCall(SNESGetLagPreconditioner(snes, &lag));
+  const bool same_kind = kept_.slope == record.stage.slope && kept_.mode == record.airway.mode;
+  kept_ = {same_kind && kept_.age < lag ? kept_.age + 1 : 1, record.stage.slope, record.airway.mode};
+  PetscCall(KSPSetReusePreconditioner(ksp_, kept_.age > 1 ? PETSC_TRUE : PETSC_FALSE));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Minus what number @p k wants of a stage, as a right-hand side. What the flow into a held airway wants stands at its
+/// nodes, and acts on the other rows, which are not closed yet.
+PetscErrorCode Sweep::right_side(const StageRecord &record, std::size_t k, Wanted &w, Pending &pending, Vec right)
+{
+  const bool free = record.airway.mode == Airway::Mode::free;
+
+  PetscFunctionBeginUser;
+  if (!gas_) { // the flow is the rate of the volume
+    w.volume += w.flow * record.stage.slope;
+    want_past_volumes(record, w.flow, k, pending);
+  }
+  PetscCall(VecZeroEntries(work_));
+  if (w.state) PetscCall(VecCopy(w.state, work_));
+  if (w.volume != 0) PetscCall(model_.add_volume_gradient(x_, nullptr, w.volume, work_));
+  if (free) PetscCall(model_.airway().add_mean_gradient(w.pressure, work_));
+  PetscCall(to_global(work_, right));
+  if (gas_ && !free && w.flow != 0) {
+    PetscCall(VecZeroEntries(held_));
+    PetscCall(model_.airway().set(held_, w.flow / model_.row_scale(pressure)));
+    PetscCall(MatMult(simulation_.matrix(), held_, product_));
+    PetscCall(VecAXPY(right, 1, product_));
+  }
+  PetscCall(VecScale(right, -1));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Derivatives of the equation c(P, V) = 0 of the pressure at the opening (Airway::equation).
+Sweep::Opening Sweep::opening(const StageRecord &record, PetscInt number) const
+{
+  const PetscReal L = model_.composition().mesh().length(), h3 = L * L * L, modulus = model_.modulus();
+  const auto &tube = scene_.facts().tube;
+  if (record.airway.control == Control::flow) return {0, 1 / h3, 0, -1 / h3};
+  PetscReal Q = record.stage.slope * volumes_[static_cast<std::size_t>(number)];
+  for (int i = 0; i < 2; ++i)
+    if (record.past[i] >= 0) Q += record.weight[i] * volumes_[static_cast<std::size_t>(record.past[i])];
+  const PetscReal by_flow = tube ? tube->slope(Q) / modulus : 0;
+  return {1 / modulus, by_flow * record.stage.slope, by_flow, -1 / modulus};
+}
+
+void Sweep::want_past_volumes(const StageRecord &record, PetscReal by_flow, std::size_t k, Pending &pending) const
+{
+  for (int i = 0; i < 2; ++i)
+    if (record.past[i] >= 0) wanted(pending, record.past[i], k).volume += by_flow * record.weight[i];
+}
+
+/// Solves for what one unit of the multiplier of c adds to z.
+PetscErrorCode Sweep::solve_border(const Opening &c, std::string &failure)
+{
+  PetscFunctionBeginUser;
+  PetscCall(VecZeroEntries(work_));
+  PetscCall(model_.add_volume_gradient(x_, nullptr, -c.by_volume, work_));
+  PetscCall(to_global(work_, right_));
+  PetscCall(model_.airway().set(right_, 0));
+  PetscCall(solve(right_, product_, failure));
+  PetscCall(to_local(product_, border_));
+  PetscCall(dot(border_, column_, border_column_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Solves for z of number @p k, and adds what that wants of earlier stages. @p target: the derivative by what the phase
+/// prescribes.
+PetscErrorCode Sweep::solve_stage(const StageRecord &record, const Opening &c, std::size_t k, const Wanted &w,
+                                  Vec right, Pending &pending, Vec z, PetscReal &target, std::string &failure)
+{
+  const Airway::Condition &airway = record.airway;
+  const bool free = airway.mode == Airway::Mode::free, held = gas_ && !free;
+  PetscReal by_column, at_nodes = 0;
+
+  PetscFunctionBeginUser;
+  if (!free) PetscCall(model_.airway().set(right, 0));
+  PetscCall(solve(right, product_, failure));
+  PetscCall(to_local(product_, z));
+  if (held) PetscCall(model_.airway().fill(z, w.flow / model_.row_scale(pressure)));
+  PetscCall(dot(z, column_, by_column));
+  if (held && w.state) PetscCall(model_.airway().sum(w.state, at_nodes));
+  const PetscReal by_pressure = w.pressure + at_nodes + by_column;
+  switch (airway.mode) {
+  case Airway::Mode::free:
+    target = (w.flow + by_column) * record.stage.slope;
+    want_past_volumes(record, w.flow + by_column, k, pending);
+    break;
+  case Airway::Mode::solved: {
+    const PetscReal multiplier = -by_pressure / (c.by_pressure + border_column_);
+    PetscCall(VecAXPY(z, multiplier, border_));
+    target = multiplier * c.by_target;
+    want_past_volumes(record, multiplier * c.by_flow, k, pending);
+    break;
+  }
+  case Airway::Mode::held:
+    target = by_pressure;
+  }
+  Wanted &start = wanted(pending, record.phase_start, k);
+  if (airway.control == Control::flow)
+    start.volume += target * airway.by_start;
+  else
+    want_ventilator_pressure(record.phase_start, target * airway.by_start, start);
+  PetscCall(look_back(record, z, k, pending));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode Sweep::run(const std::vector<Functional> &functionals, PetscReal tolerance, const Visit &visit,
                           std::string &failure)
 {
-  const std::size_t count = functionals.size();
   const auto &stages = trajectory_.stages();
-  const auto &tube = scene_.facts().tube;
-  const PetscReal L = model_.composition().mesh().length(), h3 = L * L * L;
   SNES snes;
-  KSP ksp;
-  PetscReal given, kept_slope = 0;
-  PetscInt lag, age = 0;
-  Airway::Mode kept_mode = Airway::Mode::held;
+  PetscReal given;
   Pending pending;
-  std::vector<VecHandle> adjoint(count);
-  VecHandle solution, border, local_border;
-  Mat matrix = simulation_.matrix();
+  std::vector<VecHandle> adjoint(functionals.size()), rights(functionals.size());
 
   PetscFunctionBeginUser;
+  count_ = functionals.size();
   PetscCall(setup());
   for (VecHandle &z : adjoint) PetscCall(create(z));
-  PetscCall(create(local_border));
-  PetscCall(VecDuplicate(right_, solution.out()));
-  PetscCall(VecDuplicate(right_, border.out()));
+  for (VecHandle &right : rights) PetscCall(VecDuplicate(right_, right.out()));
   PetscCall(TSGetSNES(simulation_.ts(), &snes));
-  PetscCall(SNESGetKSP(snes, &ksp));
-  PetscCall(SNESGetLagPreconditioner(snes, &lag));
-  PetscCall(KSPGetTolerances(ksp, &given, nullptr, nullptr, nullptr));
-  PetscCall(KSPSetTolerances(ksp, tolerance, PETSC_DEFAULT, PETSC_DEFAULT, PETSC_DEFAULT));
-  for (std::size_t n = stages.size(); n-- > 1;) {
-    for (std::size_t k = 0; k < count; ++k) {
-      if (stages[n].row < 0) continue;
-      const auto row = static_cast<std::size_t>(stages[n].row);
-      const Functional &f = functionals[k];
-      if (f.by_volume[row] == 0 && f.by_pressure[row] == 0 && f.by_flow[row] == 0) continue;
-      pending[static_cast<PetscInt>(n)].resize(count);
-      pending[static_cast<PetscInt>(n)][k].volume += f.by_volume[row] / units::mm3_per_ml;
-      pending[static_cast<PetscInt>(n)][k].flow += f.by_flow[row] / units::mm3_per_ml;
-      want_ventilator_pressure(static_cast<PetscInt>(n), f.by_pressure[row] / units::kPa_per_cmH2O,
-                               pending[static_cast<PetscInt>(n)][k]);
-    }
-    const auto found = pending.find(static_cast<PetscInt>(n));
+  PetscCall(SNESGetKSP(snes, &ksp_));
+  PetscCall(KSPGetTolerances(ksp_, &given, nullptr, nullptr, nullptr));
+  PetscCall(KSPSetTolerances(ksp_, tolerance, PETSC_DEFAULT, PETSC_DEFAULT, PETSC_DEFAULT));
+  for (auto n = static_cast<PetscInt>(stages.size()) - 1; n > 0 && failure.empty(); --n) {
+    const StageRecord &record = stages[static_cast<std::size_t>(n)];
+    want_row(functionals, n, pending);
+    const auto found = pending.find(n);
     if (found == pending.end()) continue; // nothing depends on it
     std::vector<Wanted> want = std::move(found->second);
     pending.erase(found);
-    const StageRecord &record = stages[n];
-    const Airway::Condition &airway = record.airway;
-    const bool held = gas_ && airway.mode != Airway::Mode::free, solved = airway.mode == Airway::Mode::solved,
-               flows = airway.control == Control::flow;
-    const PetscReal slope = record.stage.slope;
-    for (const PetscInt past : record.past)
-      if (past >= 0) pending[past].resize(count);
-    pending[record.phase_start].resize(count);
-
-    PetscCall(recall(record, static_cast<PetscInt>(n)));
-    PetscCall(make_column(record));
-    PetscCall(model_.transposed_jacobian(record.time, x_, rate_, slope, matrix));
-    PetscCall(KSPSetOperators(ksp, matrix, matrix));
-    // a preconditioner is kept as long as that of a Jacobian is, for stages of one kind
-    const bool same_kind = kept_slope == slope && kept_mode == airway.mode;
-    age = same_kind && age < lag ? age + 1 : 1;
-    kept_slope = slope;
-    kept_mode = airway.mode;
-    PetscCall(KSPSetReusePreconditioner(ksp, age > 1 ? PETSC_TRUE : PETSC_FALSE));
-    // what the flow into a held airway wants stands at its nodes, and acts on the other rows before these are closed
-    std::vector<VecHandle> rights(count);
-    for (std::size_t k = 0; k < count; ++k) {
-      Wanted &w = want[k];
-      PetscCall(VecDuplicate(right_, rights[k].out()));
-      if (!gas_) { // the flow is the rate of the volume
-        w.volume += w.flow * slope;
-        for (int i = 0; i < 2; ++i)
-          if (record.past[i] >= 0) wanted(pending, record.past[i], k).volume += w.flow * record.weight[i];
-      }
-      PetscCall(VecZeroEntries(work_));
-      if (w.state) PetscCall(VecCopy(w.state, work_));
-      if (w.volume != 0) PetscCall(model_.add_volume_gradient(x_, nullptr, w.volume, work_));
-      if (airway.mode == Airway::Mode::free) PetscCall(model_.airway().add_mean_gradient(w.pressure, work_));
-      PetscCall(to_global(work_, rights[k]));
-      if (held && w.flow != 0) {
-        PetscCall(VecZeroEntries(held_));
-        PetscCall(model_.airway().set(held_, w.flow / model_.row_scale(pressure)));
-        PetscCall(MatMult(matrix, held_, product_));
-        PetscCall(VecAXPY(rights[k], 1, product_));
-      }
-      PetscCall(VecScale(rights[k], -1));
+    PetscCall(assemble(record, n));
+    for (std::size_t k = 0; k < count_; ++k) PetscCall(right_side(record, k, want[k], pending, rights[k]));
+    PetscCall(model_.airway().close_rows(simulation_.matrix(), false));
+    Opening c;
+    if (record.airway.mode == Airway::Mode::solved) {
+      c = opening(record, n);
+      PetscCall(solve_border(c, failure));
     }
-    PetscCall(model_.airway().close_rows(matrix, false));
-    const auto close = [&](Vec right) -> PetscErrorCode {
-      PetscFunctionBeginUser;
-      if (airway.mode != Airway::Mode::free) PetscCall(model_.airway().set(right, 0));
-      PetscFunctionReturn(PETSC_SUCCESS);
-    };
-    // c(P, V) = 0
-    PetscReal by_P = 0, by_V = 0, by_target = 0, by_Q = 0, border_column = 0;
-    if (solved) {
-      if (flows) {
-        by_V = 1 / h3;
-        by_target = -1 / h3;
-      } else {
-        PetscReal Q = slope * volumes_[n];
-        for (int i = 0; i < 2; ++i)
-          if (record.past[i] >= 0) Q += record.weight[i] * volumes_[static_cast<std::size_t>(record.past[i])];
-        by_P = 1 / model_.modulus();
-        by_Q = tube ? tube->slope(Q) / model_.modulus() : 0;
-        by_V = by_Q * slope;
-        by_target = -1 / model_.modulus();
-      }
-      PetscCall(VecZeroEntries(work_));
-      PetscCall(model_.add_volume_gradient(x_, nullptr, -by_V, work_));
-      PetscCall(to_global(work_, right_));
-      PetscCall(close(right_));
-      PetscCall(solve(right_, border, failure));
-      PetscCall(to_local(border, local_border));
-      PetscCall(dot(local_border, column_, border_column));
-    }
-    Solved result{record, x_, rate_, {}, {}};
-    for (std::size_t k = 0; k < count && failure.empty(); ++k) {
-      Wanted &w = want[k];
-      Vec z = adjoint[k];
-      PetscReal by_column, at_nodes = 0, target;
-      result.adjoint.push_back(z);
-      result.by_target.push_back(0);
-      if (w.nothing()) { // no later row of this number
-        PetscCall(VecZeroEntries(z));
-        continue;
-      }
-      PetscCall(close(rights[k]));
-      PetscCall(solve(rights[k], solution, failure));
-      PetscCall(to_local(solution, z));
-      if (held) PetscCall(model_.airway().fill(z, w.flow / model_.row_scale(pressure)));
-      PetscCall(dot(z, column_, by_column));
-      if (held && w.state) PetscCall(model_.airway().sum(w.state, at_nodes));
-      const PetscReal by_pressure = w.pressure + at_nodes + by_column;
-      if (airway.mode == Airway::Mode::free) {
-        const PetscReal by_flow = w.flow + by_column;
-        target = by_flow * slope;
-        for (int i = 0; i < 2; ++i)
-          if (record.past[i] >= 0) wanted(pending, record.past[i], k).volume += by_flow * record.weight[i];
-      } else if (solved) {
-        const PetscReal multiplier = -by_pressure / (by_P + border_column);
-        PetscCall(VecAXPY(z, multiplier, local_border));
-        target = multiplier * by_target;
-        for (int i = 0; i < 2; ++i)
-          if (record.past[i] >= 0) wanted(pending, record.past[i], k).volume += multiplier * by_Q * record.weight[i];
-      } else {
-        target = by_pressure;
-      }
-      Wanted &start = wanted(pending, record.phase_start, k);
-      if (flows)
-        start.volume += target * airway.by_start;
+    Solved result{record, x_, rate_, {}, std::vector<PetscReal>(count_, 0)};
+    for (std::size_t k = 0; k < count_; ++k) {
+      result.adjoint.push_back(adjoint[k]);
+      if (want[k].nothing()) // no later row of this number
+        PetscCall(VecZeroEntries(adjoint[k]));
       else
-        want_ventilator_pressure(record.phase_start, target * airway.by_start, start);
-      PetscCall(look_back(record, z, k, pending));
-      result.by_target.back() = target;
+        PetscCall(solve_stage(record, c, k, want[k], rights[k], pending, adjoint[k], result.by_target[k], failure));
     }
-    if (!failure.empty()) break;
-    if (visit) PetscCall(visit(result));
+    if (visit && failure.empty()) PetscCall(visit(result));
   }
-  PetscCall(KSPSetTolerances(ksp, given, PETSC_DEFAULT, PETSC_DEFAULT, PETSC_DEFAULT));
+  PetscCall(KSPSetTolerances(ksp_, given, PETSC_DEFAULT, PETSC_DEFAULT, PETSC_DEFAULT));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -57,16 +57,30 @@ private:
   };
   using Pending = std::map<PetscInt, std::vector<Wanted>>;
 
+  /// Derivatives of the equation of the pressure at the opening.
+  struct Opening {
+    PetscReal by_pressure = 0, by_volume = 0, by_flow = 0, by_target = 0; ///< by_flow: of the gas, through pasts, too
+  };
+
   PetscErrorCode setup();
   PetscErrorCode create(VecHandle &local) const;
   Wanted &wanted(Pending &pending, PetscInt stage, std::size_t functional) const;
+  void want_row(const std::vector<Functional> &functionals, PetscInt stage, Pending &pending) const;
   /// Adds a derivative by the pressure at the ventilator at the end of a stage, 1/kPa.
   void want_ventilator_pressure(PetscInt stage, PetscReal derivative, Wanted &wanted) const;
+  /// Adds a derivative by the flow of gas of a stage, s/mm^3, to the volumes that it looks back at.
+  void want_past_volumes(const StageRecord &record, PetscReal by_flow, std::size_t k, Pending &pending) const;
   /// Makes the model that of a stage; fills x_ and rate_.
   PetscErrorCode recall(const StageRecord &record, PetscInt number);
   /// Derivative of the local residual by the pressure at the opening, 1/kPa, or by the flow prescribed on a free
   /// airway, s/mm^3.
   PetscErrorCode make_column(const StageRecord &record);
+  PetscErrorCode assemble(const StageRecord &record, PetscInt number);
+  PetscErrorCode right_side(const StageRecord &record, std::size_t k, Wanted &w, Pending &pending, Vec right);
+  Opening opening(const StageRecord &record, PetscInt number) const;
+  PetscErrorCode solve_border(const Opening &c, std::string &failure);
+  PetscErrorCode solve_stage(const StageRecord &record, const Opening &c, std::size_t k, const Wanted &w, Vec right,
+                             Pending &pending, Vec z, PetscReal &target, std::string &failure);
   PetscErrorCode solve(Vec right, Vec solution, std::string &failure);
   PetscErrorCode to_global(Vec local, Vec global) const;
   PetscErrorCode to_local(Vec global, Vec local) const;
@@ -80,11 +94,19 @@ private:
   Model &model_;
   Simulation &simulation_;
   const Trajectory &trajectory_;
-  bool gas_ = false; ///< there is a mass balance
+  std::size_t count_ = 0; ///< of the numbers
+  KSP ksp_ = nullptr;     ///< of the run
+  bool gas_ = false;      ///< there is a mass balance
   std::optional<bool> other_rates_;
-  std::vector<PetscReal> volumes_, flows_; ///< [stage]: mm^3; through the opening, mm^3/s
-  VecHandle x_, rate_, past_, column_, work_, other_;
-  VecHandle right_, held_, product_;
+  struct {
+    PetscInt age = 0;
+    PetscReal slope = 0;
+    Airway::Mode mode = Airway::Mode::held;
+  } kept_;                                                     ///< the stage whose preconditioner is in use, stages ago
+  std::vector<PetscReal> volumes_, flows_;                     ///< [stage]: mm^3; through the opening, mm^3/s
+  VecHandle x_, rate_, past_, column_, border_, work_, other_; ///< local
+  VecHandle right_, held_, product_;                           ///< global
+  PetscReal border_column_ = 0;
   PetscInt solves_ = 0, krylov_ = 0;
 };
 
