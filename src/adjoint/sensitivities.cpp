@@ -140,6 +140,10 @@ PetscErrorCode Sensitivities::check(const Options &options, const Scene &scene, 
                    "-sensitivities knows no number '%s'; give some of %s", name.c_str(), list.c_str());
   const std::string obstacle = Sweep::obstacle(scene, model);
   PulmoUserCheck(obstacle.empty(), options.comm(), "-sensitivities %s; or leave the option out", obstacle.c_str());
+  if (scene.facts().ventilator->may_end_early())
+    PetscCall(PetscPrintf(options.comm(),
+                          "pulmo: note: -sensitivities: phases that end early by a trigger or by cycling "
+                          "are taken to end where they do now, whatever a parameter is\n"));
   PulmoUserCheck(!restarts, options.comm(),
                  "-sensitivities needs the states of the whole run, and a restart has not those before it; run from "
                  "the start, or leave the option out");

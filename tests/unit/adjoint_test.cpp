@@ -51,7 +51,7 @@ PetscErrorCode run_scene(const std::string &options, bool sweeps, Swept &result)
 /// A breath on the cube of 24 cells.
 struct Breath {
   const char *name, *options;
-  double share = 1e-3;  ///< by which parameters are moved
+  double share = 2e-4;  ///< by which parameters are moved
   bool cut = false;     ///< steps are cut
   bool forward = false; ///< Tangent knows it
 };
@@ -253,15 +253,14 @@ TEST_P(Adjoint, IsTheDerivativeOfTheRun)
     SCOPED_TRACE(parameter.option);
     const double share = GetParam().share;
     std::vector<double> change(swept.report.numbers.size(), 0);
-    // differences of fourth order
-    for (const auto &[by, weight] : {std::pair<double, double>{-2, 1}, {-1, -8}, {1, 8}, {2, -1}}) {
+    for (const double by : {-1, 1}) {
       Swept moved;
       std::ostringstream text;
       text.precision(17);
       text << options << " " << parameter.option << " " << parameter.value * (1 + by * share);
       PULMO_OK(run_scene(text.str(), false, moved));
       for (std::size_t k = 0; k < change.size(); ++k)
-        change[k] += weight * functional(swept.report.numbers[k].name, moved.rows).value().value / (12 * share);
+        change[k] += by * functional(swept.report.numbers[k].name, moved.rows).value().value / (2 * share);
     }
     for (std::size_t k = 0; k < change.size(); ++k) {
       const SensitivityReport::Number &number = swept.report.numbers[k];
@@ -356,14 +355,14 @@ TEST_P(AdjointIdentity, SweepAndTangentAgree)
 std::vector<Breath> breaths(bool forward)
 {
   std::vector<Breath> list = {
-      Breath{"pressure_control", GAS PCV, 1e-3, false, true},
-      Breath{"flow_by_area", GAS VCV "-ventilator_flow_split uniform", 1e-3, false, true},
-      Breath{"common_pressure", GAS VCV "-ventilator_flow_split common_pressure", 1e-3, false, true},
+      Breath{"pressure_control", GAS PCV, 2e-4, false, true},
+      Breath{"flow_by_area", GAS VCV "-ventilator_flow_split uniform", 2e-4, false, true},
+      Breath{"common_pressure", GAS VCV "-ventilator_flow_split common_pressure", 2e-4, false, true},
       Breath{"tube", GAS PCV "-tube -tube_k1 4 -tube_k2 6e3 -ventilator_peep 1"},
       Breath{"volume_control_through_a_tube", GAS VCV "-tube -tube_k1 4 -tube_k2 6e3"},
       Breath{"pressure_control_without_airflow", "-airflow off " PCV},
       Breath{"volume_control_without_airflow", "-airflow off " VCV "-ventilator_tidal_volume 3e-5"},
-      Breath{"two_breaths_with_peep", GAS VCV "-ventilator_peep 2 -ventilator_breaths 2", 1e-3, false, true},
+      Breath{"two_breaths_with_peep", GAS VCV "-ventilator_peep 2 -ventilator_breaths 2", 2e-4, false, true},
       Breath{"bdf", GAS PCV "-ts_type bdf"},
       Breath{"bdf_volume_control", GAS VCV "-ts_type bdf"},
       Breath{"jump", GAS PCV "-ventilator_ramp 0 -ts_dt 0.05"},

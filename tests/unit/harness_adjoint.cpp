@@ -77,8 +77,7 @@ PetscErrorCode check_adjoint(const Subject &subject, Findings &findings)
   if (!swept.failure.empty()) findings.push_back("its sweep fails: " + swept.failure);
   for (const SensitivityReport::Parameter &p : swept.parameters) {
     std::vector<double> change(swept.numbers.size(), 0);
-    // differences of fourth order
-    for (const auto &[by, weight] : {std::pair<double, double>{-2, 1}, {-1, -8}, {1, 8}, {2, -1}}) {
+    for (const double by : {-1, 1}) {
       ShortRun moved;
       std::ostringstream option;
       option.precision(17);
@@ -88,7 +87,7 @@ PetscErrorCode check_adjoint(const Subject &subject, Findings &findings)
         findings.push_back("its run with " + option.str() + " fails: " + moved.failure);
         PetscFunctionReturn(PETSC_SUCCESS);
       }
-      for (std::size_t k = 0; k < change.size(); ++k) change[k] += weight * moved.numbers[k] / (12 * share);
+      for (std::size_t k = 0; k < change.size(); ++k) change[k] += by * moved.numbers[k] / (2 * share);
     }
     for (std::size_t k = 0; k < change.size(); ++k)
       if (const double found = p.derivative[k] * p.value;
