@@ -35,7 +35,7 @@ install(DIRECTORY petsc_options meshes DESTINATION ${data})
 install(PROGRAMS tools/breathe tools/export tools/report tools/lung_mesh tools/sphere_mesh tools/cell_values tools/accuracy_cost tools/reproduce_paper
         DESTINATION ${data}/tools)
 install(DIRECTORY tools/accuracy tools/benchmarks tools/breathing tools/exports tools/meshing tools/paper tools/python tools/reports tools/shared
-        DESTINATION ${data}/tools FILES_MATCHING PATTERN "*.py")
+        DESTINATION ${data}/tools FILES_MATCHING PATTERN "*.py" PATTERN __pycache__ EXCLUDE)
 install(DIRECTORY tools/reports/templates DESTINATION ${data}/tools/reports)
 install(FILES tools/packaging/slurm/pulmo.sbatch DESTINATION ${data}/tools/packaging/slurm)
 install(FILES docs/paper/page.md.in DESTINATION ${data}/docs/paper)

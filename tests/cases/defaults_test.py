@@ -176,7 +176,8 @@ class Split(Default):
         self.assertNotIn("shares the flow by area", case.out)
 
     def test_help_says_what_was_chosen(self):
-        case = pulmo.Case(self.FLOW + cube(lambda x: abs(x[2] - 25) > 24.9) + BASE + ["-help"])
+        # PETSc's own part has bytes that were never set, as the default of -dm_plex_boundary_label (3.18)
+        case = pulmo.Case(self.FLOW + cube(lambda x: abs(x[2] - 25) > 24.9) + BASE + ["-help"], errors="replace")
         self.assertIn("in this scene -ventilator_flow_split is common_pressure", case.out)
 
 
