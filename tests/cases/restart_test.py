@@ -519,6 +519,9 @@ class Signals(RestartCase):
         ranks = run.workers()
         os.kill(ranks[1], signal.SIGKILL)
         self.assertNotEqual(run.end()[0], 0)
+        deadline = time.monotonic() + 10 # mpiexec kills the others, and need not wait until they are gone
+        while any(alive(pid) for pid in ranks) and time.monotonic() < deadline:
+            time.sleep(0.05)
         for pid in ranks:
             self.assertFalse(alive(pid), "a rank lives on")
 
