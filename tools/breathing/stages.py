@@ -48,8 +48,16 @@ def interrupt(*_):
 @contextlib.contextmanager
 def started(command, **more):
     """A program at work, in a group of its own. It ends with this one, whatever ends it, and so does what it started in its group."""
-    process = subprocess.Popen([str(word) for word in command], stdout=subprocess.PIPE, text=True, start_new_session=True, **more)
+    # a signal between the start of the program and the next line would leave it to itself
+    former = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     try:
+        process = subprocess.Popen([str(word) for word in command], stdout=subprocess.PIPE, text=True, start_new_session=True,
+                                   preexec_fn=lambda: signal.pthread_sigmask(signal.SIG_SETMASK, former), **more)
+    except BaseException:
+        signal.pthread_sigmask(signal.SIG_SETMASK, former)
+        raise
+    try:
+        signal.pthread_sigmask(signal.SIG_SETMASK, former)  # what came meanwhile comes now
         yield process
         process.wait()
     except BaseException:
