@@ -231,12 +231,25 @@ PetscErrorCode add_derivatives(const Options &options, const Scene &scene, Model
 PetscErrorCode Sensitivities::make(const Options &options, const Scene &scene, Model &model, Simulation &simulation,
                                    const std::vector<SignalRow> &rows, SensitivityReport &report)
 {
+  const MPI_Comm comm = options.comm();
   Sweep sweep(scene, model, simulation, *trajectory_);
   std::vector<Functional> functionals;
   PetscLogDouble begin, end;
+  PetscMPIInt rank, lacking; // the first rank that has not all states
 
   PetscFunctionBeginUser;
   PetscCall(PetscTime(&begin));
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  lacking = trajectory_->complaint().empty() ? PETSC_MPI_INT_MAX : rank;
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &lacking, 1, MPI_INT, MPI_MIN, comm));
+  if (lacking != PETSC_MPI_INT_MAX) {
+    PetscMPIInt length = static_cast<PetscMPIInt>(trajectory_->complaint().size());
+    report.failure = trajectory_->complaint();
+    PetscCallMPI(MPI_Bcast(&length, 1, MPI_INT, lacking, comm));
+    report.failure.resize(static_cast<std::size_t>(length));
+    PetscCallMPI(MPI_Bcast(report.failure.data(), length, MPI_CHAR, lacking, comm));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
   for (const std::string &name : names_) {
     const auto f = functional(name, rows);
     if (f)
@@ -244,7 +257,14 @@ PetscErrorCode Sensitivities::make(const Options &options, const Scene &scene, M
     else
       report.undefined.push_back(name);
   }
+  StopSignal signal(comm);
+  sweep.heed(signal);
+  PetscCall(PetscPrintf(comm, "\nSensitivities: a sweep back over %d steps\n",
+                        static_cast<int>(simulation.rows().size()) - 1));
   PetscCall(add_derivatives(options, scene, model, sweep, functionals, tolerance_, report));
+  PulmoFailureCheck(!sweep.stopped(), comm,
+                    "stopped by %s during the sweep of -sensitivities; the run itself is whole, without them",
+                    signal.name());
   PetscCall(PetscTime(&end));
   report.seconds = end - begin;
   PetscFunctionReturn(PETSC_SUCCESS);

@@ -193,9 +193,7 @@ PetscErrorCode print_sensitivities(MPI_Comm comm, const SensitivityReport &repor
   for (const std::string &name : report.undefined)
     PetscCall(PetscPrintf(comm, "pulmo: note: -sensitivities: this run has no %s\n", name.c_str()));
   if (!report.failure.empty()) {
-    PetscCall(PetscPrintf(comm,
-                          "pulmo: warning: no sensitivities: %s; solvers/direct.opts solves whatever the run solved\n",
-                          report.failure.c_str()));
+    PetscCall(PetscPrintf(comm, "pulmo: warning: no sensitivities: %s\n", report.failure.c_str()));
     PetscFunctionReturn(PETSC_SUCCESS);
   }
   if (report.numbers.empty()) PetscFunctionReturn(PETSC_SUCCESS);

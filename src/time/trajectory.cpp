@@ -1,7 +1,5 @@
 #include "pulmo/time/trajectory.hpp"
 
-#include "pulmo/input/errors.hpp"
-
 #include <cerrno>
 #include <cstring>
 #include <unistd.h>
@@ -18,6 +16,7 @@ PetscErrorCode Trajectory::keep(StageRecord record, const TimeScheme &scheme, Ve
   const auto number = static_cast<PetscInt>(stages_.size());
 
   PetscFunctionBeginUser;
+  if (!complaint_.empty()) PetscFunctionReturn(PETSC_SUCCESS);
   if (number > 0) {
     record.past = {last_, -1};
     if (scheme.looks_back_at() == PointMemory::Past::middle) record.past[1] = middle_;
@@ -50,15 +49,12 @@ PetscErrorCode Trajectory::keep(StageRecord record, const TimeScheme &scheme, Ve
       (void)unlink(name.c_str()); // gone with the run, however that ends
       file_ = fdopen(descriptor, "w+b");
     }
-    PetscCheck(file_, PETSC_COMM_SELF, PETSC_ERR_FILE_OPEN, "no file for the states of a run in %s: %s",
-               folder_.c_str(), std::strerror(errno));
   }
-  bool written = std::fseek(file_, 0, SEEK_END) == 0;
-  place_.back() = std::ftell(file_);
-  written = written && std::fwrite(x.data(), 1, bytes, file_) == bytes && std::fflush(file_) == 0;
-  PetscCheck(written, PETSC_COMM_SELF, PETSC_ERR_FILE_WRITE,
-             "the states of the run did not fit into %s (%s); give -sensitivities_memory more, or room there",
-             folder_.c_str(), std::strerror(errno));
+  const bool written = file_ && std::fseek(file_, 0, SEEK_END) == 0 && (place_.back() = std::ftell(file_)) >= 0 &&
+                       std::fwrite(x.data(), 1, bytes, file_) == bytes && std::fflush(file_) == 0;
+  if (!written)
+    complaint_ = "the states of the run did not fit into " + folder_ + " (" + std::strerror(errno) +
+                 "); give -sensitivities_memory more, or make room there";
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -1,6 +1,9 @@
 #!/usr/bin/python3
 """-sensitivities: the program's table and summary, ranks, states in a file, what is refused, and that a scene without it pays nothing."""
+import json
 import os
+import signal
+import subprocess
 import unittest
 
 import pulmo_case as pc
@@ -52,6 +55,27 @@ class Sensitivities(unittest.TestCase):
         krylov = pc.finished(SCENE[:len(pc.BLOCK + pc.QUIET + pc.PAPER)] + pc.options_file("solvers/iterative.opts") +
                              SCENE[len(pc.BLOCK + pc.QUIET + pc.PAPER + pc.DIRECT):] + ASK)
         self.same(run, krylov, 1e-6)
+
+    def test_a_solver_that_does_not_solve(self):
+        """Twelve iterations are enough for Newton's method, and not for a sweep to twelve digits: told, and no derivative is given."""
+        short = pc.finished(SCENE[:len(pc.BLOCK + pc.QUIET + pc.PAPER)] + pc.options_file("solvers/iterative.opts") +
+                            SCENE[len(pc.BLOCK + pc.QUIET + pc.PAPER + pc.DIRECT):] + ["-ksp_max_it", "12"] + ASK)
+        self.assertIn("warning: no sensitivities: the solver leaves ", short.out)
+        self.assertIn("direct.opts", short.json()["sensitivities"]["failure"])
+        self.assertEqual(short.json()["sensitivities"]["numbers"], {})
+
+    def test_stopped(self):
+        """A signal during the sweep: the run's own results are whole, the exit code is that of a run that could not go on."""
+        directory = pc.scratch()
+        process = subprocess.Popen([pc.PROGRAM, *map(str, SCENE + ["-dm_refine", "2", "-sensitivities", "C_rs,R"]), "-output_dir", directory],
+                                   cwd=pc.SOURCE, env=pc.alone(), text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        said = next(line for line in process.stdout if "a sweep back over" in line)
+        process.send_signal(signal.SIGTERM)
+        out, err = process.communicate(timeout=120)
+        self.assertEqual(process.returncode, 2, said + out + err)
+        self.assertIn("stopped by SIGTERM during the sweep", err)
+        with open(os.path.join(directory, "summary.json"), encoding="utf-8") as f:
+            self.assertNotIn("sensitivities", json.load(f))
 
     def test_regions(self):
         """A value that changes in one lung alone, where all is alike and where the lungs differ; against runs that differ so."""

@@ -352,6 +352,34 @@ TEST_P(AdjointIdentity, SweepAndTangentAgree)
   EXPECT_GE(found, 4);
 }
 
+/// On several ranks one of them has no room.
+TEST(StatesInAFile, ThatCannotBeWrittenEndNoRun)
+{
+  const Registry registry = Registry::standard();
+  SceneRun run(registry);
+  Sensitivities sensitivities;
+  SensitivityReport report;
+  bool finished = false;
+  PetscMPIInt rank, size;
+  PULMO_OK(MPI_Comm_rank(PETSC_COMM_WORLD, &rank));
+  PULMO_OK(MPI_Comm_size(PETSC_COMM_WORLD, &size));
+  PULMO_OK(set_options("-options_file " + source("petsc_options/solvers/tight.opts") + " -dm_plex_filename " +
+                       source("meshes/cube_coarse.msh") +
+                       " -mesh_scale 1 -chest_wall -chest_wall_surfaces x0,z1 -chest_wall_stiffness 0.3 -ts_dt 0.1 "
+                       "-tissue yoshihara " GAS PCV "-sensitivities V_T -sensitivities_memory 0"));
+  PULMO_OK(run.declare());
+  PULMO_OK(sensitivities.declare(run.options()));
+  PULMO_OK(run.setup());
+  PULMO_OK(sensitivities.attach(run.simulation(), rank == size - 1 ? "/none/of/these" : testing::TempDir()));
+  PULMO_OK(run.simulation().run(finished));
+  EXPECT_TRUE(finished);
+  PULMO_OK(
+      sensitivities.make(run.options(), run.scene(), run.model(), run.simulation(), run.simulation().rows(), report));
+  EXPECT_NE(report.failure.find("did not fit into /none/of/these"), std::string::npos) << report.failure;
+  EXPECT_NE(report.failure.find("-sensitivities_memory"), std::string::npos) << report.failure;
+  EXPECT_TRUE(report.numbers.empty());
+}
+
 std::vector<Breath> breaths(bool forward)
 {
   std::vector<Breath> list = {

@@ -45,6 +45,10 @@ public:
   PetscErrorCode run(const std::vector<Functional> &functionals, PetscReal tolerance, const Visit &visit,
                      std::string &failure);
 
+  /// Lets @p request end the sweep after the stage at hand; stopped() tells that it did. It must outlive the sweep.
+  void heed(StopRequest &request) { stop_request_ = &request; }
+  bool stopped() const { return stopped_; }
+
   PetscInt solves() const { return solves_; }
   PetscInt krylov() const { return krylov_; }
 
@@ -105,8 +109,10 @@ private:
   } kept_;                                                     ///< the stage whose preconditioner is in use, stages ago
   std::vector<PetscReal> volumes_, flows_;                     ///< [stage]: mm^3; through the opening, mm^3/s
   VecHandle x_, rate_, past_, column_, border_, work_, other_; ///< local
-  VecHandle right_, held_, product_;                           ///< global
-  PetscReal border_column_ = 0;
+  VecHandle right_, held_, product_, residual_;                ///< global
+  PetscReal border_column_ = 0, tolerance_ = 0;
+  StopRequest *stop_request_ = nullptr;
+  bool stopped_ = false;
   PetscInt solves_ = 0, krylov_ = 0;
 };
 

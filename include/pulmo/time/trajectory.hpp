@@ -35,15 +35,18 @@ public:
 
   /// The stage accepted last ends the one phase and begins the next.
   void begin_phase() { phase_start_ = last_; }
-  /// Adds a stage with the local state @p local. What it looks back at follows from @p scheme.
+  /// Adds a stage with the local state @p local. What it looks back at follows from @p scheme. A file that cannot be
+  /// written does not end the run: from then on nothing is kept, and complaint() tells why.
   PetscErrorCode keep(StageRecord record, const TimeScheme &scheme, Vec local);
   const std::vector<StageRecord> &stages() const { return stages_; }
+  /// Why this rank does not have all states; empty: it has.
+  const std::string &complaint() const { return complaint_; }
   /// Fills @p local with the state of a stage, constrained values in place.
   PetscErrorCode state(PetscInt stage, Vec local) const;
 
 private:
   std::size_t memory_, used_ = 0;
-  std::string folder_;
+  std::string folder_, complaint_;
   std::vector<StageRecord> stages_;
   std::vector<std::vector<PetscScalar>> kept_; ///< [stage]; empty: in the file
   std::vector<std::int64_t> place_;            ///< [stage]: in the file
