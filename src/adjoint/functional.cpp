@@ -4,6 +4,7 @@
 #include "pulmo/observers/clinical.hpp"
 
 #include <algorithm>
+#include <cmath>
 #include <functional>
 
 namespace pulmo {
@@ -17,6 +18,7 @@ struct Breath {
   const Rows &rows;
   std::size_t rest, first, last;
   ClinicalNumbers numbers;
+  const std::vector<double> &kinks; ///< s
 };
 
 /// The row of (first, last] with the largest @p value.
@@ -28,11 +30,67 @@ std::size_t largest(const Breath &b, const std::function<double(const SignalRow 
   return most;
 }
 
+/// The first row of each stretch without a kink, up to the last row of all.
+std::vector<std::size_t> stretches(const Rows &rows, const std::vector<double> &kinks)
+{
+  std::vector<std::size_t> list = {0};
+  for (std::size_t i = 1; i + 1 < rows.size(); ++i) {
+    const double near = rows[i].dt / 1000;
+    if (rows[i + 1].phase != rows[i].phase ||
+        std::any_of(kinks.begin(), kinks.end(), [&](double t) { return std::abs(t - rows[i].time) < near; }))
+      list.push_back(i);
+  }
+  list.push_back(rows.size() - 1);
+  return list;
+}
+
+/// Every other row of each stretch, its ends included.
+Rows every_other(const Rows &rows, const std::vector<double> &kinks)
+{
+  const std::vector<std::size_t> ends = stretches(rows, kinks);
+  Rows list = {rows.front()};
+  for (std::size_t s = 0; s + 1 < ends.size(); ++s)
+    for (std::size_t i = ends[s] + 1; i <= ends[s + 1]; ++i) {
+      if ((i - ends[s]) % 2 != 0 && i != ends[s + 1]) continue;
+      list.push_back(rows[i]);
+      list.back().dt = rows[i].time - list[list.size() - 2].time;
+    }
+  return list;
+}
+
+/// What sums over more rows on the same curves would tend to, by Richardson's extrapolation of @p value, which is
+/// @p coarse with every other row. Of order 3/2: after a kink the flow goes with the root of time.
+double extrapolated(double value, const std::optional<double> &coarse)
+{
+  return coarse ? value + (value - *coarse) / (std::exp2(1.5) - 1) : value;
+}
+
+/// By how much the parabola through row @p i, where @p value is largest, and its neighbours rises above it.
+double rise_between(const Breath &b, std::size_t i, const std::function<double(const SignalRow &)> &value)
+{
+  const std::vector<std::size_t> ends = stretches(b.rows, b.kinks);
+  if (i <= b.first || i >= b.last || std::find(ends.begin(), ends.end(), i) != ends.end()) return 0;
+  const double s = b.rows[i].time - b.rows[i - 1].time, t = b.rows[i + 1].time - b.rows[i].time, y = value(b.rows[i]),
+               before = (y - value(b.rows[i - 1])) / s, after = (value(b.rows[i + 1]) - y) / t,
+               curvature = (after - before) / (s + t), slope = before + curvature * s;
+  return curvature < 0 ? -slope * slope / (4 * curvature) : 0;
+}
+
+/// Whether the largest @p value, in row @p i, is one of a curve: not that of a phase's first step alone.
+bool is_resolved(const Breath &b, std::size_t i, const std::function<double(const SignalRow &)> &value)
+{
+  constexpr double plain = 0.02; // what is prescribed stays
+  const bool first = i == b.first + 1 || b.rows[i - 1].phase != b.rows[i].phase;
+  return !first || i == b.last || value(b.rows[i + 1]) > (1 - plain) * value(b.rows[i]);
+}
+
 bool tidal_volume(const Breath &b, Functional &f)
 {
   if (!b.numbers.takes_in) return false;
+  const auto volume = [](const SignalRow &r) { return r.volume; };
   f.value = b.numbers.tidal_volume;
-  f.by_volume[largest(b, [](const SignalRow &r) { return r.volume; })] += 1;
+  f.better_value = f.value + rise_between(b, largest(b, volume), volume);
+  f.by_volume[largest(b, volume)] += 1;
   f.by_volume[b.first] -= 1;
   return true;
 }
@@ -41,6 +99,7 @@ bool peak_pressure(const Breath &b, Functional &f)
 {
   f.value = b.numbers.peak_pressure;
   const std::size_t i = largest(b, [](const SignalRow &r) { return r.machine_pressure(); });
+  f.better_value = f.value;
   f.by_pressure[b.rows[i].machine_pressure() > b.rows[b.first].machine_pressure() ? i : b.first] = 1;
   return true;
 }
@@ -48,7 +107,7 @@ bool peak_pressure(const Breath &b, Functional &f)
 bool plateau_pressure(const Breath &b, Functional &f)
 {
   if (!b.numbers.plateau_pressure) return false;
-  f.value = *b.numbers.plateau_pressure;
+  f.value = f.better_value = *b.numbers.plateau_pressure;
   f.by_pressure[end_of_inspiration(b.rows, b.first, b.last)] = 1;
   return true;
 }
@@ -56,16 +115,22 @@ bool plateau_pressure(const Breath &b, Functional &f)
 bool peak_flow(const Breath &b, Functional &f)
 {
   if (!(b.numbers.peak_flow > 0)) return false;
+  const auto flow = [](const SignalRow &r) { return r.flow; };
   f.value = b.numbers.peak_flow;
-  f.by_flow[largest(b, [](const SignalRow &r) { return r.flow; })] = 1;
+  f.better_value = f.value + rise_between(b, largest(b, flow), flow);
+  f.resolved = is_resolved(b, largest(b, flow), flow);
+  f.by_flow[largest(b, flow)] = 1;
   return true;
 }
 
 bool peak_expiratory_flow(const Breath &b, Functional &f)
 {
   if (!(b.numbers.peak_expiratory_flow > 0)) return false;
+  const auto outward = [](const SignalRow &r) { return -r.flow; };
   f.value = b.numbers.peak_expiratory_flow;
-  f.by_flow[largest(b, [](const SignalRow &r) { return -r.flow; })] = -1;
+  f.better_value = f.value + rise_between(b, largest(b, outward), outward);
+  f.resolved = is_resolved(b, largest(b, outward), outward);
+  f.by_flow[largest(b, outward)] = -1;
   return true;
 }
 
@@ -102,6 +167,7 @@ bool compliance(const Breath &b, Functional &f)
 {
   if (!b.numbers.compliance || !b.numbers.resistance) return false; // a fit without flow is another one
   f.value = *b.numbers.compliance;
+  f.better_value = extrapolated(f.value, overall_numbers(every_other(b.rows, b.kinks)).compliance);
   add_fit(b, -f.value * f.value, 0, f);
   return true;
 }
@@ -110,6 +176,7 @@ bool resistance(const Breath &b, Functional &f)
 {
   if (!b.numbers.compliance || !b.numbers.resistance) return false;
   f.value = *b.numbers.resistance;
+  f.better_value = extrapolated(f.value, overall_numbers(every_other(b.rows, b.kinks)).resistance);
   add_fit(b, 0, 1000, f);
   return true;
 }
@@ -119,6 +186,7 @@ bool work(const Breath &b, Functional &f)
 {
   const double peep = b.rows[b.first].machine_pressure(), j = units::kPa_per_cmH2O * 1e-3;
   f.value = b.numbers.work;
+  f.better_value = extrapolated(f.value, overall_numbers(every_other(b.rows, b.kinks)).work);
   for (std::size_t i = b.first + 1; i <= b.last; ++i) {
     const SignalRow &r = b.rows[i], &before = b.rows[i - 1];
     const double mean = (r.machine_pressure() + before.machine_pressure()) / 2 - peep, dV = r.volume - before.volume;
@@ -157,7 +225,7 @@ std::vector<std::string> functional_names()
   return names;
 }
 
-std::optional<Functional> functional(const std::string &name, const Rows &rows)
+std::optional<Functional> functional(const std::string &name, const Rows &rows, const std::vector<double> &kinks)
 {
   const auto breaths = complete_breaths(rows);
   const Known *k = std::find_if(std::begin(known), std::end(known), [&](const Known &one) { return name == one.name; });
@@ -167,7 +235,8 @@ std::optional<Functional> functional(const std::string &name, const Rows &rows)
   f.name = k->name;
   f.unit = k->unit;
   for (auto *gradient : {&f.by_volume, &f.by_pressure, &f.by_flow}) gradient->assign(rows.size(), 0);
-  const Breath breath{rows, breaths.front().first, breaths.back().first, breaths.back().last, overall_numbers(rows)};
+  const Breath breath{rows, breaths.front().first, breaths.back().first, breaths.back().last, overall_numbers(rows),
+                      kinks};
   if (!k->make(breath, f)) return {};
   return f;
 }

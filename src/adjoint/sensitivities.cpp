@@ -118,12 +118,6 @@ PetscErrorCode Sensitivities::declare(Options &options)
   options.group("sensitivities", "derivatives of clinical numbers by the parameters of the scene");
   PetscCall(
       options.names("", "after the run, one sweep back gives the derivatives of these numbers: " + known, names_));
-  options.group("sensitivities", "", in_use(), "-sensitivities");
-  PetscCall(options.real("memory", "MB", Range::not_negative(),
-                         "for the states of the run on each rank; more of them go to a file in the output directory",
-                         memory_));
-  PetscCall(options.real("rtol", "-", Range::between(1e-14, 0.1), "relative tolerance of the sweep's linear systems",
-                         tolerance_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -147,15 +141,6 @@ PetscErrorCode Sensitivities::check(const Options &options, const Scene &scene, 
   PulmoUserCheck(!restarts, options.comm(),
                  "-sensitivities needs the states of the whole run, and a restart has not those before it; run from "
                  "the start, or leave the option out");
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode Sensitivities::attach(Simulation &simulation, const std::string &folder)
-{
-  PetscFunctionBeginUser;
-  if (!in_use()) PetscFunctionReturn(PETSC_SUCCESS);
-  trajectory_ = std::make_unique<Trajectory>(static_cast<std::size_t>(memory_ * 1e6), folder);
-  simulation.record(*trajectory_);
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -207,6 +192,7 @@ PetscErrorCode add_derivatives(const Options &options, const Scene &scene, Model
     }
     PetscFunctionReturn(PETSC_SUCCESS);
   };
+  sweep.ask_targets();
   if (count > 0) PetscCall(sweep.run(functionals, tolerance, visit, report.failure));
   PetscCall(scene.mesh().regions(regions));
   for (std::size_t i = 0; i < parameters.size(); ++i) {
@@ -229,27 +215,18 @@ PetscErrorCode add_derivatives(const Options &options, const Scene &scene, Model
 }
 
 PetscErrorCode Sensitivities::make(const Options &options, const Scene &scene, Model &model, Simulation &simulation,
-                                   const std::vector<SignalRow> &rows, SensitivityReport &report)
+                                   const Recording &recording, const std::vector<SignalRow> &rows,
+                                   SensitivityReport &report)
 {
   const MPI_Comm comm = options.comm();
-  Sweep sweep(scene, model, simulation, *trajectory_);
+  Sweep sweep(scene, model, simulation, recording.trajectory());
   std::vector<Functional> functionals;
   PetscLogDouble begin, end;
-  PetscMPIInt rank, lacking; // the first rank that has not all states
 
   PetscFunctionBeginUser;
   PetscCall(PetscTime(&begin));
-  PetscCallMPI(MPI_Comm_rank(comm, &rank));
-  lacking = trajectory_->complaint().empty() ? PETSC_MPI_INT_MAX : rank;
-  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &lacking, 1, MPI_INT, MPI_MIN, comm));
-  if (lacking != PETSC_MPI_INT_MAX) {
-    PetscMPIInt length = static_cast<PetscMPIInt>(trajectory_->complaint().size());
-    report.failure = trajectory_->complaint();
-    PetscCallMPI(MPI_Bcast(&length, 1, MPI_INT, lacking, comm));
-    report.failure.resize(static_cast<std::size_t>(length));
-    PetscCallMPI(MPI_Bcast(report.failure.data(), length, MPI_CHAR, lacking, comm));
-    PetscFunctionReturn(PETSC_SUCCESS);
-  }
+  PetscCall(recording.complaint(comm, report.failure));
+  if (!report.failure.empty()) PetscFunctionReturn(PETSC_SUCCESS);
   for (const std::string &name : names_) {
     const auto f = functional(name, rows);
     if (f)
@@ -261,7 +238,7 @@ PetscErrorCode Sensitivities::make(const Options &options, const Scene &scene, M
   sweep.heed(signal);
   PetscCall(PetscPrintf(comm, "\nSensitivities: a sweep back over %d steps\n",
                         static_cast<int>(simulation.rows().size()) - 1));
-  PetscCall(add_derivatives(options, scene, model, sweep, functionals, tolerance_, report));
+  PetscCall(add_derivatives(options, scene, model, sweep, functionals, recording.tolerance(), report));
   PulmoFailureCheck(!sweep.stopped(), comm,
                     "stopped by %s during the sweep of -sensitivities; the run itself is whole, without them",
                     signal.name());

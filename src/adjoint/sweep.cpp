@@ -261,7 +261,10 @@ PetscErrorCode Sweep::assemble(const StageRecord &record, PetscInt number)
 
   PetscFunctionBeginUser;
   PetscCall(recall(record, number));
-  PetscCall(make_column(record));
+  if (targets_ || record.airway.mode != Airway::Mode::held || record.airway.by_start != 0)
+    PetscCall(make_column(record));
+  else
+    PetscCall(VecZeroEntries(column_));
   PetscCall(model_.transposed_jacobian(record.time, x_, rate_, record.stage.slope, matrix));
   PetscCall(KSPSetOperators(ksp_, matrix, matrix));
   // a preconditioner is kept as long as that of a Jacobian is, for stages of one kind
@@ -332,11 +335,12 @@ PetscErrorCode Sweep::solve_border(const Opening &c, std::string &failure)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-/// Solves for z of number @p k, and adds what that wants of earlier stages. @p target: the derivative by what the phase
-/// prescribes.
+/// Solves for z of number @p k, and adds what that wants of earlier stages.
 PetscErrorCode Sweep::solve_stage(const StageRecord &record, const Opening &c, std::size_t k, const Wanted &w,
-                                  Vec right, Pending &pending, Vec z, PetscReal &target, std::string &failure)
+                                  Vec right, Pending &pending, Solved &result, std::string &failure)
 {
+  const Vec z = result.adjoint[k];
+  PetscReal &target = result.by_target[k];
   const Airway::Condition &airway = record.airway;
   const bool free = airway.mode == Airway::Mode::free, held = gas_ && !free;
   PetscReal by_column, at_nodes = 0;
@@ -349,14 +353,21 @@ PetscErrorCode Sweep::solve_stage(const StageRecord &record, const Opening &c, s
   PetscCall(dot(z, column_, by_column));
   if (held && w.state) PetscCall(model_.airway().sum(w.state, at_nodes));
   const PetscReal by_pressure = w.pressure + at_nodes + by_column;
+  result.by_volume[k] = w.volume;
+  result.by_flow[k] = gas_ ? 0 : w.flow;
   switch (airway.mode) {
   case Airway::Mode::free:
-    target = (w.flow + by_column) * record.stage.slope;
-    want_past_volumes(record, w.flow + by_column, k, pending);
+    result.by_mean_pressure[k] = w.pressure;
+    result.by_flow[k] = w.flow + by_column;
+    target = result.by_flow[k] * record.stage.slope;
+    want_past_volumes(record, result.by_flow[k], k, pending);
     break;
   case Airway::Mode::solved: {
     const PetscReal multiplier = -by_pressure / (c.by_pressure + border_column_);
     PetscCall(VecAXPY(z, multiplier, border_));
+    result.opening[k] = multiplier;
+    result.by_volume[k] += multiplier * c.by_volume;
+    result.by_flow[k] += multiplier * c.by_flow;
     target = multiplier * c.by_target;
     want_past_volumes(record, multiplier * c.by_flow, k, pending);
     break;
@@ -409,13 +420,14 @@ PetscErrorCode Sweep::run(const std::vector<Functional> &functionals, PetscReal 
       c = opening(record, n);
       PetscCall(solve_border(c, failure));
     }
-    Solved result{record, x_, rate_, {}, std::vector<PetscReal>(count_, 0)};
+    const std::vector<PetscReal> none(count_, 0);
+    Solved result{n, record, x_, rate_, {}, none, none, none, none, none};
+    for (VecHandle &z : adjoint) result.adjoint.push_back(z);
     for (std::size_t k = 0; k < count_; ++k) {
-      result.adjoint.push_back(adjoint[k]);
       if (want[k].nothing()) // no later row of this number
         PetscCall(VecZeroEntries(adjoint[k]));
       else
-        PetscCall(solve_stage(record, c, k, want[k], rights[k], pending, adjoint[k], result.by_target[k], failure));
+        PetscCall(solve_stage(record, c, k, want[k], rights[k], pending, result, failure));
     }
     if (visit && failure.empty()) PetscCall(visit(result));
   }

@@ -470,4 +470,11 @@ PetscErrorCode Assembly::add_transposed_product(PetscReal t, Vec x, Vec x_t, Pet
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode Assembly::cell_matrices(PetscReal t, Vec x, Vec x_t, PetscReal shift, const TakeMatrix &take)
+{
+  PetscFunctionBeginUser;
+  PetscCall(for_matrices(Part::all, t, x, x_t, shift, nullptr, nullptr, take));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 } // namespace pulmo

@@ -5,6 +5,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <memory>
 
 namespace pulmo {
 
@@ -142,16 +143,51 @@ PetscErrorCode Assembly::volume_derivative(Vec x, Vec y, PetscReal &derivative) 
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+/// The pressure field at the points where J is watched, once something is weighed by it.
+PetscErrorCode Assembly::prepare_weighing()
+{
+  PetscFE fe;
+
+  PetscFunctionBeginUser;
+  if (weighing_.nodes() > 0) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(PetscDSGetDiscretization(ds_, pressure, (PetscObject *)&fe));
+  PetscCall(weighing_.setup(fe, watched_at_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Assembly::weighted_volume(Vec x, const std::vector<Vec> &weights,
+                                         std::vector<std::vector<PetscReal>> &sums)
+{
+  std::vector<std::unique_ptr<ReadArray>> arrays;
+
+  PetscFunctionBeginUser;
+  PetscCall(prepare_weighing());
+  const ReadArray xs(x);
+  const element::ScalarBasis mass = weighing_.basis();
+  for (const Vec weight : weights) arrays.push_back(std::make_unique<ReadArray>(weight));
+  sums.assign(weights.size(), std::vector<PetscReal>(static_cast<std::size_t>(layout_.cells), 0));
+  for (PetscInt c = 0; c < layout_.cells; ++c) {
+    const PetscInt *dofs = cell_dofs(c), *mass_dofs = dofs + 3 * watched_.basis().nodes;
+    const CellDisplacement u(watched_, &invJ_[9 * c], dofs, xs.data());
+    for (std::size_t q = 0; q < rule_weights_.size(); ++q) {
+      PetscScalar H[9];
+      u.gradient(static_cast<PetscInt>(q), H);
+      const PetscReal gain = rule_weights_[q] * detJ_[c] * jacobian_minus_one(H);
+      const PetscReal *values = mass.values + static_cast<PetscInt>(q) * mass.stride;
+      for (std::size_t k = 0; k < weights.size(); ++k)
+        for (PetscInt a = 0; a < mass.nodes; ++a)
+          sums[k][static_cast<std::size_t>(c)] += gain * values[a] * (*arrays[k])[mass_dofs[a]];
+    }
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode Assembly::add_volume_gradient(Vec x, Vec weight, PetscReal factor, Vec y)
 {
   const element::ScalarBasis basis = watched_.basis();
 
   PetscFunctionBeginUser;
-  if (weight && weighing_.nodes() == 0) {
-    PetscFE fe;
-    PetscCall(PetscDSGetDiscretization(ds_, pressure, (PetscObject *)&fe));
-    PetscCall(weighing_.setup(fe, watched_at_));
-  }
+  if (weight) PetscCall(prepare_weighing());
   const ReadArray xs(x), qs(weight ? weight : x);
   WriteArray ys(y);
   for (PetscInt c = 0; c < layout_.cells; ++c) {

@@ -10,7 +10,38 @@ namespace {
 /// Factors of safety of an extrapolation whose order is as it should be, or not (Oberkampf & Roy 2010).
 constexpr double factor_of_safety = 1.25, doubtful_factor = 3;
 
+/// What of the error in space richer elements see, where its order is 1 in h/p^2.
+constexpr double seen_by_richer = 0.75;
+
+/// Of the bar of a sweep: over its parts, of the corrected value over that, and the largest part that is one.
+constexpr double swept_factor = 1.5, corrected_share = 0.5, largest_part = 0.2;
+
 } // namespace
+
+ErrorBar lacking_bar(const ClinicalEntry &entry, const LackingParts &parts, bool time_resolved)
+{
+  const double value = *entry.value, flow = parts.flow_in_space / seen_by_richer,
+               tissue = parts.tissue_in_space / seen_by_richer, space = std::abs(flow) + std::abs(tissue),
+               most = largest_part * std::abs(value);
+  ErrorBar bar;
+
+  bar.entry = entry;
+  bar.solver = std::abs(parts.solver);
+  if (!time_resolved)
+    bar.unresolved = "steps too long for its phases";
+  else if (!(std::abs(parts.time) <= most))
+    bar.unresolved = "steps too long";
+  else
+    bar.time = swept_factor * std::abs(parts.time);
+  if (space <= most)
+    bar.space = swept_factor * space;
+  else
+    bar.unresolved += (bar.unresolved.empty() ? "" : ", ") + std::string("cells too large");
+  if (!bar.total()) return bar;
+  bar.corrected = value + parts.time + flow + tissue + parts.solver;
+  bar.corrected_error = corrected_share * *bar.total();
+  return bar;
+}
 
 TimeError time_error(double fine, double twice, double four_times, int order)
 {
@@ -35,7 +66,7 @@ std::optional<double> ErrorBar::total() const
 
 double ErrorReport::extra_seconds() const
 {
-  double sum = 0;
+  double sum = sweep_seconds;
   for (std::size_t i = 1; i < levels.size(); ++i) sum += levels[i].seconds;
   return sum;
 }

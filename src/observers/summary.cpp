@@ -166,12 +166,16 @@ Json free_boundary_json(const std::vector<FreeBoundary> &parts)
 /// Error bars by the key of their number, and the runs they come from.
 Json errors_json(const ErrorReport &report)
 {
-  Json json;
+  Json json = {{"method", report.method}, {"numbers", Json::object()}};
   for (const ErrorBar &bar : report.bars)
-    json["numbers"][bar.entry.key] = {
-        {"value", *bar.entry.value},         {"error", optional_json(bar.total())},
-        {"time", optional_json(bar.time)},   {"time_order", optional_json(bar.time_order)},
-        {"space", optional_json(bar.space)}, {"solver", optional_json(bar.solver)}};
+    json["numbers"][bar.entry.key] = {{"value", *bar.entry.value},
+                                      {"error", optional_json(bar.total())},
+                                      {"time", optional_json(bar.time)},
+                                      {"time_order", optional_json(bar.time_order)},
+                                      {"space", optional_json(bar.space)},
+                                      {"solver", optional_json(bar.solver)},
+                                      {"corrected", optional_json(bar.corrected)},
+                                      {"corrected_error", optional_json(bar.corrected_error)}};
   json["runs"] = Json::array();
   for (const ErrorLevel &level : report.levels) {
     Json run = {{"name", level.name},      {"dt_s", level.dt},     {"cells", level.cells},
@@ -181,6 +185,7 @@ Json errors_json(const ErrorReport &report)
     for (const ClinicalEntry &e : level.numbers) run["numbers"][e.key] = optional_json(e.value);
     json["runs"].push_back(run);
   }
+  if (!report.failure.empty()) json["failure"] = report.failure;
   json["extra_seconds"] = report.extra_seconds();
   return json;
 }

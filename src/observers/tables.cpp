@@ -169,17 +169,29 @@ PetscErrorCode print_error_bars(MPI_Comm comm, const ErrorReport &report)
   const ErrorLevel &run = report.levels.front();
 
   PetscFunctionBeginUser;
-  PetscCall(PetscPrintf(comm, "\n%-52s %9s %9s %9s\n", "Numerical errors (docs/accuracy/error_bars.md)", "time",
-                        "space", "solver"));
-  for (const ErrorBar &bar : report.bars)
-    PetscCall(PetscPrintf(comm, "  %-28s %10.4g ± %-7s %-10s %9s %9s %9s\n", bar.entry.label, *bar.entry.value,
+  const bool swept = report.method == "sweep";
+  if (!report.failure.empty()) {
+    PetscCall(PetscPrintf(comm, "pulmo: warning: no error estimate: %s\n", report.failure.c_str()));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+  PetscCall(PetscPrintf(comm, "\n%-52s %9s %9s %9s%s\n", "Numerical errors (docs/accuracy/error_bars.md)", "time",
+                        "space", "solver", swept ? "   corrected" : ""));
+  for (const ErrorBar &bar : report.bars) {
+    std::string rest = bar.unresolved.empty() ? "" : "   not resolved: " + bar.unresolved;
+    if (bar.corrected) {
+      char text[64];
+      std::snprintf(text, sizeof(text), "   %.4g ± %.2g", *bar.corrected, *bar.corrected_error);
+      rest = text;
+    }
+    PetscCall(PetscPrintf(comm, "  %-28s %10.4g ± %-7s %-10s %9s %9s %9s%s\n", bar.entry.label, *bar.entry.value,
                           part(bar.total()).c_str(), bar.entry.unit, part(bar.time).c_str(), part(bar.space).c_str(),
-                          part(bar.solver).c_str()));
+                          part(bar.solver).c_str(), rest.c_str()));
+  }
   for (const ErrorLevel &level : report.levels)
     if (!level.failure.empty())
       PetscCall(PetscPrintf(comm, "  ?: %s: %s\n", level.name.c_str(), level.failure.c_str()));
-  PetscCall(PetscPrintf(comm, "The bars took %.3g s beside the %.3g s of the run (%+.0f %%):", report.extra_seconds(),
-                        run.seconds, 100 * report.extra_seconds() / run.seconds));
+  PetscCall(PetscPrintf(comm, "The bars took %.3g s beside the %.3g s of the run (%+.0f %%)%s", report.extra_seconds(),
+                        run.seconds, 100 * report.extra_seconds() / run.seconds, swept ? ": one sweep back" : ":"));
   for (std::size_t i = 1; i < report.levels.size(); ++i)
     PetscCall(
         PetscPrintf(comm, "%s %s %.3g s", i > 1 ? "," : "", report.levels[i].name.c_str(), report.levels[i].seconds));

@@ -1,5 +1,8 @@
 #include "pulmo/program/error_estimate.hpp"
 
+#include "pulmo/adjoint/error_parts.hpp"
+#include "pulmo/adjoint/recording.hpp"
+
 #include "pulmo/base/units.hpp"
 #include "pulmo/mesh/read_mesh.hpp"
 #include "pulmo/observers/output.hpp"
@@ -149,7 +152,11 @@ ErrorBar error_bar(const std::vector<ErrorLevel> &levels, std::size_t i, int ord
 
 PetscErrorCode ErrorEstimate::declare(Options &options)
 {
+  std::string known;
+
   PetscFunctionBeginUser;
+  for (const std::string &name : functional_names()) known += (known.empty() ? "" : ", ") + name;
+  method_ = "sweep";
   options.group("error_estimate", "numerical error bars");
   PetscCall(options.flag("",
                          "after the run, run again with steps 2 and 4 times as long, tighter tolerances and another "
@@ -159,19 +166,58 @@ PetscErrorCode ErrorEstimate::declare(Options &options)
                          "the other mesh: a coarser or finer one of the same lung; without it this one refined once "
                          "(with -dm_refine: once less), which takes several times the memory",
                          mesh_));
+  PetscCall(options.choice("method", {"sweep", "runs"},
+                           "one sweep back over the run, or more runs; where it is not given sweep, if the scene has "
+                           "nothing that keeps a sweep from it",
+                           method_));
+  PetscCall(options.names("numbers", "of a sweep: " + known + "; all that the run has where it is not given", names_));
+  sweeps_ = method_ == "sweep" && mesh_.empty();
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode ErrorEstimate::check(const Options &options, const Scene &scene) const
+PetscErrorCode ErrorEstimate::choose_method(const Options &options, const Scene &scene, const Model &model,
+                                            bool restarts)
+{
+  const std::vector<std::string> known = functional_names();
+  std::string obstacle = ErrorParts::obstacle(scene, model);
+  PetscBool given;
+
+  PetscFunctionBeginUser;
+  for (const std::string &name : names_)
+    PulmoUserCheck(std::find(known.begin(), known.end(), name) != known.end(), options.comm(),
+                   "-error_estimate_numbers knows no '%s'; -help lists what there is", name.c_str());
+  if (method_ != "sweep") {
+    PulmoUserCheck(names_.empty(), options.comm(),
+                   "-error_estimate_numbers is for -error_estimate_method sweep; more runs have all numbers");
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+  if (obstacle.empty() && restarts) obstacle = "needs the states before the restart, too";
+  if (obstacle.empty() && !mesh_.empty()) obstacle = "takes no other mesh (-error_estimate_mesh)";
+  sweeps_ = obstacle.empty();
+  if (sweeps_) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(PetscOptionsHasName(nullptr, nullptr, "-error_estimate_method", &given));
+  PulmoUserCheck(!given && names_.empty(), options.comm(),
+                 "-error_estimate_method sweep %s; give -error_estimate_method runs, which makes more runs",
+                 obstacle.c_str());
+  method_ = "runs";
+  if (mesh_.empty())
+    PetscCall(PetscPrintf(options.comm(), "pulmo: note: -error_estimate makes four more runs: a sweep %s\n",
+                          obstacle.c_str()));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode ErrorEstimate::check(const Options &options, const Scene &scene, const Model &model, bool restarts)
 {
   PetscFunctionBeginUser;
   if (!in_use_) {
     PulmoUserCheck(mesh_.empty(), options.comm(), "-error_estimate_mesh %s has no effect without -error_estimate",
                    mesh_.c_str());
+    PulmoUserCheck(names_.empty(), options.comm(), "-error_estimate_numbers has no effect without -error_estimate");
     PetscFunctionReturn(PETSC_SUCCESS);
   }
   PulmoUserCheck(scene.facts().ventilator, options.comm(),
                  "-error_estimate gives the errors of clinical numbers: it needs -ventilator");
+  PetscCall(choose_method(options, scene, model, restarts));
   if (!mesh_.empty()) {
     PetscCall(check_mesh_file(options.comm(), "-error_estimate_mesh", mesh_));
     PetscCall(try_other_mesh(options, scene));
@@ -315,6 +361,51 @@ PetscErrorCode ErrorEstimate::make(const Options &options, const Output &output,
                             "run with a smaller -ts_dt tells";
   for (std::size_t i = 0; i < numbers.size(); ++i)
     if (numbers[i].value) report.bars.push_back(error_bar(levels, i, longer ? simulation.scheme().order() : 0));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode ErrorEstimate::make_by_sweep(const Options &options, const Scene &scene, Model &model,
+                                            Simulation &simulation, const Recording &recording,
+                                            const std::vector<SignalRow> &rows,
+                                            const std::vector<ClinicalEntry> &numbers, ErrorReport &report) const
+{
+  const MPI_Comm comm = options.comm();
+  Sweep sweep(scene, model, simulation, recording.trajectory());
+  ErrorParts parts(scene, model, simulation, recording.trajectory());
+  std::vector<Functional> functionals;
+  PetscLogDouble begin, end;
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscTime(&begin));
+  report.method = "sweep";
+  report.levels.resize(1);
+  PetscCall(describe_level(simulation, scene, report.levels.front()));
+  report.levels.front().name = "the run itself";
+  report.levels.front().seconds = simulation.seconds().total;
+  report.levels.front().numbers = numbers;
+  PetscCall(recording.complaint(comm, report.failure));
+  if (!report.failure.empty()) PetscFunctionReturn(PETSC_SUCCESS);
+  for (const std::string &name : names_.empty() ? functional_names() : names_) {
+    const auto f = functional(name, rows, parts.kinks());
+    if (f) functionals.push_back(*f);
+  }
+  StopSignal signal(comm);
+  sweep.heed(signal);
+  PetscCall(PetscPrintf(comm, "\nError estimate: a sweep back over %d steps\n",
+                        static_cast<int>(simulation.rows().size()) - 1));
+  PetscCall(parts.run(sweep, functionals, recording.tolerance(), report.failure));
+  PulmoFailureCheck(!sweep.stopped(), comm,
+                    "stopped by %s while the errors were estimated; the run itself is whole, without error bars",
+                    signal.name());
+  for (std::size_t k = 0; k < functionals.size(); ++k) {
+    const auto entry = std::find_if(numbers.begin(), numbers.end(),
+                                    [&](const ClinicalEntry &e) { return functionals[k].key == e.key; });
+    PetscCheck(entry != numbers.end() && entry->value, PETSC_COMM_SELF, PETSC_ERR_PLIB, "no clinical number %s",
+               functionals[k].key.c_str());
+    report.bars.push_back(lacking_bar(*entry, parts.lacking()[k], parts.time_resolved() && functionals[k].resolved));
+  }
+  PetscCall(PetscTime(&end));
+  report.sweep_seconds = end - begin;
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

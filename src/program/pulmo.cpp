@@ -1,6 +1,7 @@
 // The program as a library: initialisation, a scene made ready (Run), a whole run with its files (run()).
 #include "pulmo/pulmo.hpp"
 
+#include "pulmo/adjoint/recording.hpp"
 #include "pulmo/adjoint/sensitivities.hpp"
 #include "pulmo/base/units.hpp"
 #include "pulmo/fem/held.hpp"
@@ -237,6 +238,7 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   ErrorEstimate error_estimate(registry);
   DryRun dry_run(registry);
   Sensitivities sensitivities;
+  Recording recording;
   Checkpoint checkpoint(options, output, scene, run.model(), simulation);
   SceneWords words;
   bool view_effects = false, view_scene = false, only_scene = false, audit_energy = true, asked_to_stop = false;
@@ -251,6 +253,7 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   PetscCall(error_estimate.declare(options));
   PetscCall(dry_run.declare(options));
   PetscCall(sensitivities.declare(options));
+  PetscCall(recording.declare(options, sensitivities.in_use() || error_estimate.sweeps()));
   options.group("scene", "the scene in words");
   PetscCall(options.flag("view", "print before the run what is in the scene, what is not, and how far its tissue goes",
                          view_scene));
@@ -273,7 +276,7 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   PetscCall(describe_scene(options, scene, run.model(), simulation, words));
   if (view_scene || only_scene || dry_run.in_use()) PetscCall(print_scene(comm, words));
   PetscCall(look_ahead(comm, scene, run.model(), simulation, run.settle_note()));
-  PetscCall(error_estimate.check(options, scene));
+  PetscCall(error_estimate.check(options, scene, run.model(), !checkpoint.restart().empty()));
   PetscCall(dry_run.check(options, checkpoint.restart()));
   PetscCall(sensitivities.check(options, scene, run.model(), !checkpoint.restart().empty()));
   if (only_scene) {
@@ -333,7 +336,7 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   PetscCall(output.prepare(options, checkpoint.restart(), fields.files()));
   PetscCall(write_scene(options, words, output.path("scene.json")));
   if (restarts) PetscCall(fields.carry_over(checkpoint.restart_directory()));
-  PetscCall(sensitivities.attach(simulation, output.directory()));
+  if (sensitivities.in_use() || error_estimate.sweeps()) PetscCall(recording.attach(simulation, output.directory()));
   {
     StopSignal signal(comm);
     simulation.heed(signal);
@@ -361,7 +364,7 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   const std::vector<SignalRow> rows = regions.complete(simulation.rows());
   SensitivityReport sensitivity_report;
   if (sensitivities.in_use() && !asked_to_stop) {
-    PetscCall(sensitivities.make(options, scene, run.model(), simulation, rows, sensitivity_report));
+    PetscCall(sensitivities.make(options, scene, run.model(), simulation, recording, rows, sensitivity_report));
     audits.sensitivities = &sensitivity_report;
     PetscCall(write_summary(options, output, scene, run.model(), simulation, audits, true));
     PetscCall(print_sensitivities(comm, sensitivity_report, simulation.seconds().total));
@@ -371,7 +374,12 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
                           asked_to_stop ? "the run was asked to stop" : why_no_numbers(scene, rows).c_str()));
   } else if (error_estimate.in_use()) {
     ErrorReport report;
-    PetscCall(error_estimate.make(options, output, scene, simulation, regions.numbers(simulation.rows()), report));
+    const std::vector<ClinicalEntry> numbers = regions.numbers(simulation.rows());
+    if (error_estimate.sweeps())
+      PetscCall(
+          error_estimate.make_by_sweep(options, scene, run.model(), simulation, recording, rows, numbers, report));
+    else
+      PetscCall(error_estimate.make(options, output, scene, simulation, numbers, report));
     audits.errors = &report;
     PetscCall(write_summary(options, output, scene, run.model(), simulation, audits, true));
     PetscCall(print_error_bars(comm, report));

@@ -54,7 +54,7 @@ PetscErrorCode Trajectory::keep(StageRecord record, const TimeScheme &scheme, Ve
                        std::fwrite(x.data(), 1, bytes, file_) == bytes && std::fflush(file_) == 0;
   if (!written)
     complaint_ = "the states of the run did not fit into " + folder_ + " (" + std::strerror(errno) +
-                 "); give -sensitivities_memory more, or make room there";
+                 "); give -sweep_memory more, or make room there";
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -12,7 +12,7 @@ SCENE = (pc.BLOCK + pc.QUIET + pc.PAPER + pc.DIRECT + ["-ts_dt", "0.1", "-snes_r
          ["-tissue", "yoshihara", "-airflow", "-airflow_permeability", "100", "-airflow_surfaces", "x1", "-chest_wall",
           "-chest_wall_surfaces", "x0,y0,y1,z0,z1", "-ventilator", "vcv", "-ventilator_tidal_volume", "200", "-ventilator_ramp_down", "0.3",
           "-ventilator_inspiration", "0.5", "-ventilator_expiration", "0.8", "-energy_audit", "off"])
-ASK = ["-sensitivities", "C_rs,R,PIP,V_T", "-sensitivities_rtol", "1e-12"]
+ASK = ["-sensitivities", "C_rs,R,PIP,V_T", "-sweep_rtol", "1e-12"]
 
 
 def table(case, column="derivative"):
@@ -49,7 +49,7 @@ class Sensitivities(unittest.TestCase):
         for ranks in (2, 3):
             with self.subTest(ranks=ranks):
                 self.same(run, pc.finished(SCENE + ASK, ranks=ranks), 1e-7)
-        file = pc.finished(SCENE + ASK + ["-sensitivities_memory", "0"])
+        file = pc.finished(SCENE + ASK + ["-sweep_memory", "0"])
         self.same(run, file, 1e-12)
         self.assertEqual([name for name in os.listdir(file.directory) if "trajectory" in name], [])
         krylov = pc.finished(SCENE[:len(pc.BLOCK + pc.QUIET + pc.PAPER)] + pc.options_file("solvers/iterative.opts") +
@@ -109,8 +109,8 @@ class Sensitivities(unittest.TestCase):
                                (["-sensitivities", "C_rs", "-viscoelastic"], "-viscoelastic"),
                                (["-sensitivities", "C_rs", "-airway_tree", "star"], "-airway_tree"),
                                (["-sensitivities", "C_rs", "-petscfe_type", "basic"], "-petscfe_type"),
-                               (["-sensitivities_rtol", "1e-3"], "-sensitivities"),
-                               (["-sensitivities", "C_rs", "-sensitivities_rtol", "0"], "out of range")):
+                               (["-sweep_rtol", "1e-3"], "-sensitivities"),
+                               (["-sensitivities", "C_rs", "-sweep_rtol", "0"], "out of range")):
             with self.subTest(options=options):
                 case = pc.Case(SCENE + options)
                 self.assertEqual(case.code, 1, case.tail())

@@ -26,16 +26,18 @@ PetscErrorCode run_scene(const std::string &options, bool sweeps, Swept &result)
   const Registry registry = Registry::standard();
   SceneRun run(registry);
   Sensitivities sensitivities;
+  Recording recording;
   bool finished = false;
 
   PetscFunctionBeginUser;
   PetscCall(set_options("-options_file " + source("petsc_options/solvers/tight.opts") + " " + options +
-                        (sweeps ? std::string(" -sensitivities_rtol 1e-13 -sensitivities ") + numbers : "")));
+                        (sweeps ? std::string(" -sweep_rtol 1e-13 -sensitivities ") + numbers : "")));
   PetscCall(run.declare());
   PetscCall(sensitivities.declare(run.options()));
+  PetscCall(recording.declare(run.options(), sweeps));
   PetscCall(run.setup());
   PetscCall(sensitivities.check(run.options(), run.scene(), run.model(), false));
-  PetscCall(sensitivities.attach(run.simulation(), testing::TempDir()));
+  if (sweeps) PetscCall(recording.attach(run.simulation(), testing::TempDir()));
   PetscCall(run.simulation().run(finished));
   PetscCheck(finished, PETSC_COMM_SELF, PETSC_ERR_LIB, "%s", run.simulation().failure_text().c_str());
   result.rows = run.simulation().rows();
@@ -43,8 +45,8 @@ PetscErrorCode run_scene(const std::string &options, bool sweeps, Swept &result)
     row.flow_resistance = run.scene().facts().airflow || run.scene().facts().tube;
   result.rejected = run.simulation().rejected_steps();
   if (sweeps)
-    PetscCall(
-        sensitivities.make(run.options(), run.scene(), run.model(), run.simulation(), result.rows, result.report));
+    PetscCall(sensitivities.make(run.options(), run.scene(), run.model(), run.simulation(), recording, result.rows,
+                                 result.report));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -358,6 +360,7 @@ TEST(StatesInAFile, ThatCannotBeWrittenEndNoRun)
   const Registry registry = Registry::standard();
   SceneRun run(registry);
   Sensitivities sensitivities;
+  Recording recording;
   SensitivityReport report;
   bool finished = false;
   PetscMPIInt rank, size;
@@ -366,17 +369,18 @@ TEST(StatesInAFile, ThatCannotBeWrittenEndNoRun)
   PULMO_OK(set_options("-options_file " + source("petsc_options/solvers/tight.opts") + " -dm_plex_filename " +
                        source("meshes/cube_coarse.msh") +
                        " -mesh_scale 1 -chest_wall -chest_wall_surfaces x0,z1 -chest_wall_stiffness 0.3 -ts_dt 0.1 "
-                       "-tissue yoshihara " GAS PCV "-sensitivities V_T -sensitivities_memory 0"));
+                       "-tissue yoshihara " GAS PCV "-sensitivities V_T -sweep_memory 0"));
   PULMO_OK(run.declare());
   PULMO_OK(sensitivities.declare(run.options()));
+  PULMO_OK(recording.declare(run.options(), true));
   PULMO_OK(run.setup());
-  PULMO_OK(sensitivities.attach(run.simulation(), rank == size - 1 ? "/none/of/these" : testing::TempDir()));
+  PULMO_OK(recording.attach(run.simulation(), rank == size - 1 ? "/none/of/these" : testing::TempDir()));
   PULMO_OK(run.simulation().run(finished));
   EXPECT_TRUE(finished);
-  PULMO_OK(
-      sensitivities.make(run.options(), run.scene(), run.model(), run.simulation(), run.simulation().rows(), report));
+  PULMO_OK(sensitivities.make(run.options(), run.scene(), run.model(), run.simulation(), recording,
+                              run.simulation().rows(), report));
   EXPECT_NE(report.failure.find("did not fit into /none/of/these"), std::string::npos) << report.failure;
-  EXPECT_NE(report.failure.find("-sensitivities_memory"), std::string::npos) << report.failure;
+  EXPECT_NE(report.failure.find("-sweep_memory"), std::string::npos) << report.failure;
   EXPECT_TRUE(report.numbers.empty());
 }
 

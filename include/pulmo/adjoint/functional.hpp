@@ -16,6 +16,11 @@ namespace pulmo {
 struct Functional {
   std::string key, name, unit; ///< key: in summary.json; name: short
   double value = 0;
+  /// What more rows on the same curves would make of it: sums extrapolated from those over every other row, and largest
+  /// values by a parabola through three rows.
+  double better_value = 0;
+  /// False: the largest value is that of the first step of its phase, and may have no limit as steps get shorter.
+  bool resolved = true;
   /// [row], in the number's unit per ml, per cmH2O of the pressure at the machine, and per ml/s.
   std::vector<double> by_volume, by_pressure, by_flow;
 };
@@ -24,7 +29,8 @@ struct Functional {
 std::vector<std::string> functional_names();
 
 /// The number with the short name @p name of a run with these signals, as overall_numbers() has it; empty if the run
-/// does not define it.
-std::optional<Functional> functional(const std::string &name, const std::vector<SignalRow> &rows);
+/// does not define it. @p kinks: times within phases at which curves may have one, s.
+std::optional<Functional> functional(const std::string &name, const std::vector<SignalRow> &rows,
+                                     const std::vector<double> &kinks = {});
 
 } // namespace pulmo

@@ -2,6 +2,7 @@
 /// `-sensitivities`: how clinical numbers follow the parameters of a scene, from one backward sweep.
 #pragma once
 
+#include "pulmo/adjoint/recording.hpp"
 #include "pulmo/adjoint/sweep.hpp"
 #include "pulmo/observers/sensitivity_report.hpp"
 
@@ -13,24 +14,20 @@ PetscErrorCode add_derivatives(const Options &options, const Scene &scene, Model
                                const std::vector<Functional> &functionals, PetscReal tolerance,
                                SensitivityReport &report);
 
-/// Records a run and sweeps back over it.
+/// Sweeps back over a recorded run.
 class Sensitivities {
 public:
-  /// Declares -sensitivities and its settings.
+  /// Declares -sensitivities.
   PetscErrorCode declare(Options &options);
   bool in_use() const { return !names_.empty(); }
   /// Refuses what the sweep cannot do, before the run. @p restarts: the run goes on from a checkpoint.
   PetscErrorCode check(const Options &options, const Scene &scene, const Model &model, bool restarts) const;
-  /// Lets the simulation keep its stages; a file beside memory would be in @p folder.
-  PetscErrorCode attach(Simulation &simulation, const std::string &folder);
   /// After the run, whose complete signals are @p rows.
   PetscErrorCode make(const Options &options, const Scene &scene, Model &model, Simulation &simulation,
-                      const std::vector<SignalRow> &rows, SensitivityReport &report);
+                      const Recording &recording, const std::vector<SignalRow> &rows, SensitivityReport &report);
 
 private:
   std::vector<std::string> names_;
-  PetscReal memory_ = 2000, tolerance_ = 1e-6;
-  std::unique_ptr<Trajectory> trajectory_;
 };
 
 } // namespace pulmo

@@ -32,10 +32,15 @@ public:
 
   /// What is known once a stage was solved.
   struct Solved {
+    PetscInt number; ///< of the stage
     const StageRecord &record;
     Vec state, rate;                  ///< local, of the stage
     std::vector<Vec> adjoint;         ///< [functional]: z, local, with the rows of a held airway
-    std::vector<PetscReal> by_target; ///< [functional]: its derivative by StageRecord::airway.target
+    std::vector<PetscReal> by_target; ///< [functional]: its derivative by StageRecord::airway.target (ask_targets())
+    /// [functional]: what it wants of the volume, 1/mm^3, and of the mean pressure of a free airway, 1/kPa, with the
+    /// multiplier of the opening's equation in place, which stands in @p opening.
+    std::vector<PetscReal> by_volume, by_mean_pressure, opening;
+    std::vector<PetscReal> by_flow; ///< [functional]: of the gas of this stage through the opening, s/mm^3
   };
   using Visit = std::function<PetscErrorCode(const Solved &)>;
 
@@ -44,6 +49,11 @@ public:
   /// one.
   PetscErrorCode run(const std::vector<Functional> &functionals, PetscReal tolerance, const Visit &visit,
                      std::string &failure);
+
+  /// Asks for Solved::by_target: a held airway needs two residuals a stage for it.
+  void ask_targets() { targets_ = true; }
+  /// Whether rates act in the kernels by more than the gas that is stored; known once a stage was solved.
+  bool other_rates() const { return other_rates_.value_or(false); }
 
   /// Lets @p request end the sweep after the stage at hand; stopped() tells that it did. It must outlive the sweep.
   void heed(StopRequest &request) { stop_request_ = &request; }
@@ -84,7 +94,7 @@ private:
   Opening opening(const StageRecord &record, PetscInt number) const;
   PetscErrorCode solve_border(const Opening &c, std::string &failure);
   PetscErrorCode solve_stage(const StageRecord &record, const Opening &c, std::size_t k, const Wanted &w, Vec right,
-                             Pending &pending, Vec z, PetscReal &target, std::string &failure);
+                             Pending &pending, Solved &result, std::string &failure);
   PetscErrorCode solve(Vec right, Vec solution, std::string &failure);
   PetscErrorCode to_global(Vec local, Vec global) const;
   PetscErrorCode to_local(Vec global, Vec local) const;
@@ -101,6 +111,7 @@ private:
   std::size_t count_ = 0; ///< of the numbers
   KSP ksp_ = nullptr;     ///< of the run
   bool gas_ = false;      ///< there is a mass balance
+  bool targets_ = false;
   std::optional<bool> other_rates_;
   struct {
     PetscInt age = 0;

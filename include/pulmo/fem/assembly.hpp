@@ -9,6 +9,7 @@
 #include "pulmo/fem/tabulation.hpp"
 #include "pulmo/physics/kinematics.hpp"
 
+#include <functional>
 #include <vector>
 
 namespace pulmo {
@@ -85,6 +86,10 @@ public:
   /// what is held has rows and columns, too.
   PetscErrorCode add_transposed_product(PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[],
                                         Vec z, Vec y);
+  using TakeMatrix = std::function<PetscErrorCode(PetscInt cell, const PetscScalar *matrix)>;
+  /// Hands over the element matrices of dF/dx + shift dF/dx_t, rows not scaled: of all cells, then of the facets as
+  /// matrices of the cell behind.
+  PetscErrorCode cell_matrices(PetscReal t, Vec x, Vec x_t, PetscReal shift, const TakeMatrix &take);
   /// From now on the air is measured: @p airless_J is 1 - Phi0 of each cell.
   void need_air(std::vector<PetscReal> airless_J) { airless_J_ = std::move(airless_J), needs_air_ = true; }
   /// J and its integral for the local vector @p x. Collective.
@@ -94,6 +99,9 @@ public:
   /// Adds @p factor times the derivative of int (J - 1) q by the displacements to @p y; q is the pressure field of @p
   /// weight, or 1 if that is null. Local vectors.
   PetscErrorCode add_volume_gradient(Vec x, Vec weight, PetscReal factor, Vec y);
+  /// int (J - 1) q, mm^3, cell by cell; q is the pressure field of each of @p weights. Local vectors.
+  /// @p sums: [weight][cell of this rank].
+  PetscErrorCode weighted_volume(Vec x, const std::vector<Vec> &weights, std::vector<std::vector<PetscReal>> &sums);
 
   /// Kinematic states at the quadrature points, then the corners, of cell @p c (counted from 0).
   void point_states(PetscInt c, const PetscScalar *x, std::vector<PointState> &states) const;
@@ -101,6 +109,7 @@ public:
   const std::vector<PetscReal> &relative_weights() const { return relative_weights_; }
   PetscInt cells() const { return layout_.cells; }
   /// Offsets in the local vector of the dofs of cell @p c, field by field in the order of the basis.
+  const CellLayout &layout() const { return layout_; }
   const PetscInt *cell_dofs(PetscInt c) const { return layout_.cell_dofs(c); }
   const IntegrationLog &log() const { return log_; }
 
@@ -121,6 +130,7 @@ private:
   template <class Scatter>
   PetscErrorCode for_matrices(Part part, PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[],
                               CellMatrices *also, Scatter &&scatter);
+  PetscErrorCode prepare_weighing();
   PetscInt places_per_call() const;
   PetscErrorCode put_places(const std::vector<PetscReal> &rows, const std::string &surface, PetscInt begin);
   PetscFEGeom block_geometry(PetscInt begin, PetscInt n);

@@ -23,6 +23,9 @@ public:
   PetscErrorCode declare(Options &options, const Elements &elements);
   /// The rule of @p other, in place of declare().
   void integrate_as(const Model &other) { quadrature_degree_ = other.quadrature_degree_; }
+  /// A rule of degree @p degree, in place of declare().
+  void integrate_to(PetscInt degree) { quadrature_degree_ = degree; }
+  PetscInt quadrature_degree() const { return quadrature_degree_; }
   /// @p modulus: tissue stiffness that scales the equations, kPa. The composition's effects must outlive the model.
   PetscErrorCode build(Composition composition, PetscReal modulus);
 
@@ -80,6 +83,12 @@ public:
     return assembly_.add_transposed_product(t, x, x_t, shift, row_scale_.data(), z, y);
   }
 
+  /// The element matrices of that Jacobian (Assembly::cell_matrices).
+  PetscErrorCode cell_matrices(PetscReal t, Vec x, Vec x_t, PetscReal shift, const Assembly::TakeMatrix &take)
+  {
+    return assembly_.cell_matrices(t, x, x_t, shift, take);
+  }
+
   /// Lets each Jacobian hand its element matrices to @p matrices, too, which must outlive the model.
   void also_fill(CellMatrices &matrices) { also_ = &matrices; }
 
@@ -93,6 +102,11 @@ public:
   PetscErrorCode add_volume_gradient(Vec x, Vec weight, PetscReal factor, Vec y)
   {
     return assembly_.add_volume_gradient(x, weight, factor, y);
+  }
+  /// int (J - 1) q cell by cell (Assembly::weighted_volume).
+  PetscErrorCode weighted_volume(Vec x, const std::vector<Vec> &weights, std::vector<std::vector<PetscReal>> &sums)
+  {
+    return assembly_.weighted_volume(x, weights, sums);
   }
   /// Force that each of the composition's constraints bears (a pin, a held surface), from a local residual, kPa mm^2:
   /// the sum of its displacement rows.

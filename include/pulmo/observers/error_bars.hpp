@@ -25,16 +25,31 @@ TimeError time_error(double fine, double twice, double four_times, int order);
 /// difference to a mesh refined once, 1.25 times that to one twice as coarse.
 double space_error(double difference, double ratio);
 
+/// What a number lacks by the discrete adjoint of its run (pulmo/adjoint/error_parts.hpp), in its unit and signed.
+struct LackingParts {
+  double time = 0, flow_in_space = 0, tissue_in_space = 0, solver = 0;
+};
+
 /// A clinical number with what the discretisation makes it wrong by, each part in the number's unit. A part that could
 /// not be had is empty.
 struct ErrorBar {
   ClinicalEntry entry;
   std::optional<double> time, space, solver;
   std::optional<double> time_order; ///< observed
+  std::optional<double> corrected;  ///< the value with what it lacks, where its sign is known
+  std::optional<double> corrected_error;
+  std::string unresolved; ///< why a part is empty, for one who reads the table
 
   /// The sum of the parts (they may all point the same way); empty if one is missing.
   std::optional<double> total() const;
 };
+
+/// The bars of @p entry from what it lacks. Of the error in space richer elements take so much as they would of one of
+/// order 1 in h and 2 in their degree, 3/4 from P1 to P2: what a rim leaves. 1.5 times the parts make the bar, those of
+/// flow and tissue counted apart as they may cancel by chance, half of that the bar of the corrected value. A part of
+/// more than a fifth of the number is no small change, and its first order no estimate: it is empty then. @p
+/// time_resolved: the run's phases have enough steps.
+ErrorBar lacking_bar(const ClinicalEntry &entry, const LackingParts &parts, bool time_resolved);
 
 /// One run that the estimate was made from.
 struct ErrorLevel {
@@ -51,7 +66,10 @@ struct ErrorLevel {
 struct ErrorReport {
   std::vector<ErrorBar> bars;     ///< one for each clinical number that the run has
   std::vector<ErrorLevel> levels; ///< the run itself comes first
-  double extra_seconds() const;   ///< wall, what the estimate took
+  std::string method = "runs";    ///< or "sweep"
+  std::string failure;            ///< why there is no estimate
+  double sweep_seconds = 0;
+  double extra_seconds() const; ///< wall, what the estimate took
 };
 
 } // namespace pulmo

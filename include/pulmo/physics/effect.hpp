@@ -407,6 +407,17 @@ public:
     other.varying_ = varying_;
     return other;
   }
+  /// The same with field @p field one degree richer, for what remembers nothing at points. Of the Jacobian the rows and
+  /// columns of that field are left.
+  Composition enriched(PetscInt field) const
+  {
+    Composition other = *this;
+    ++other.fields_[static_cast<std::size_t>(field)].degree;
+    ++(field == displacement ? other.elements_.displacement_degree : other.elements_.pressure_degree);
+    const auto elsewhere = [field](const Term &t) { return t.trial >= 0 && t.trial != field && t.test != field; };
+    other.terms_.erase(std::remove_if(other.terms_.begin(), other.terms_.end(), elsewhere), other.terms_.end());
+    return other;
+  }
   /// The place of @p parameter among the constants, or -1; @p owner: of its block.
   PetscInt constant_at(const PetscReal *parameter, const char **owner) const;
   /// The surfaces on which terms read the parameters of @p owner.

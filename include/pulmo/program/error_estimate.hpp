@@ -7,22 +7,27 @@
 
 namespace pulmo {
 
+class Model;
 class Output;
+class Recording;
 class Registry;
 class Scene;
 class Simulation;
 
-/// Runs the scene again with steps of 2 dt and 4 dt, with 4 dt and tighter tolerances, and with 4 dt on another mesh;
-/// docs/accuracy/error_bars.md.
+/// One sweep back over the run (ErrorParts), or the scene again with steps of 2 dt and 4 dt, with 4 dt and tighter
+/// tolerances, and with 4 dt on another mesh; docs/accuracy/error_bars.md.
 class ErrorEstimate {
 public:
   explicit ErrorEstimate(const Registry &registry) : registry_(registry) {}
 
-  /// Declares -error_estimate and -error_estimate_mesh.
+  /// Declares -error_estimate and its settings.
   PetscErrorCode declare(Options &options);
   bool in_use() const { return in_use_; }
-  /// Before the run: refuses a scene that has no clinical numbers, and a mesh that cannot be read.
-  PetscErrorCode check(const Options &options, const Scene &scene) const;
+  /// Whether a sweep back is to tell the errors; until check() whether it may.
+  bool sweeps() const { return in_use_ && sweeps_; }
+  /// Before the run: refuses a scene that has no clinical numbers, and a mesh that cannot be read. Chooses the method
+  /// where none is given. @p restarts: the run goes on from a checkpoint.
+  PetscErrorCode check(const Options &options, const Scene &scene, const Model &model, bool restarts);
   /// Refuses a run whose steps or solver @p changed at a restart (Checkpoint::numerics_changed): all bars are made of
   /// the options of its last session.
   PetscErrorCode check_sessions(const Options &options, const std::string &changed) const;
@@ -30,15 +35,22 @@ public:
   PetscErrorCode make(const Options &options, const Output &output, const Scene &scene, const Simulation &simulation,
                       const std::vector<ClinicalEntry> &numbers, ErrorReport &report) const;
 
+  /// The same by a sweep back over the recorded run, whose complete signals are @p rows.
+  PetscErrorCode make_by_sweep(const Options &options, const Scene &scene, Model &model, Simulation &simulation,
+                               const Recording &recording, const std::vector<SignalRow> &rows,
+                               const std::vector<ClinicalEntry> &numbers, ErrorReport &report) const;
+
 private:
+  PetscErrorCode choose_method(const Options &options, const Scene &scene, const Model &model, bool restarts);
   PetscErrorCode try_other_mesh(const Options &options, const Scene &scene) const;
   PetscErrorCode other_mesh(OptionList &changes, std::string &name) const;
   PetscErrorCode run_level(const Options &options, const Output &output, const OptionList &changes,
                            ErrorLevel &level) const;
 
   const Registry &registry_;
-  bool in_use_ = false;
-  std::string mesh_;
+  bool in_use_ = false, sweeps_ = false;
+  std::string mesh_, method_;
+  std::vector<std::string> names_;
 };
 
 } // namespace pulmo

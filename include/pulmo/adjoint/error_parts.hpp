@@ -1,0 +1,69 @@
+/// @file
+/// What solver, time steps and elements make the numbers of a run wrong by, from one backward sweep.
+#pragma once
+
+#include "pulmo/adjoint/enrichment.hpp"
+#include "pulmo/observers/error_bars.hpp"
+
+namespace pulmo {
+
+/// Weighs what is left of the equations of each stage by the multipliers of a sweep. With x the states of a run and z
+/// its multipliers a better run has the number G + sum of z . R_better(x) to first order (Giles & Suli, Acta Numerica
+/// 11, 2002, 145-236):
+///
+/// solver  R as it is: what Newton left;
+/// time    rates of one order more: the polynomial through states of the phase before and after the stage. Beside
+///         that the number itself is a sum over the rows, and its largest values lie between them
+///         (Functional::better_value);
+/// space   elements one degree richer (Enrichment): for the pressure in every stage, for the displacement in one of
+/// twelve.
+class ErrorParts {
+public:
+  ErrorParts(const Scene &scene, Model &model, Simulation &simulation, const Trajectory &trajectory)
+      : scene_(scene), model_(model), simulation_(simulation), trajectory_(trajectory)
+  {}
+  /// What keeps the parts from this scene, as the end of a sentence; empty: nothing does.
+  static std::string obstacle(const Scene &scene, const Model &model);
+  /// Sweeps back for @p functionals. @p failure: as of Sweep::run(). Collective.
+  PetscErrorCode run(Sweep &sweep, const std::vector<Functional> &functionals, PetscReal tolerance,
+                     std::string &failure);
+  /// When the ramps of the run ended, s.
+  std::vector<double> kinks() const;
+  /// What each number lacks.
+  const std::vector<LackingParts> &lacking() const { return lacking_; }
+  /// [number][cell of this rank]: the part in space.
+  const std::vector<std::vector<PetscReal>> &in_space() const { return in_space_; }
+  /// Whether each phase that counts has as many steps as the part in time needs.
+  bool time_resolved() const { return time_resolved_; }
+
+private:
+  using ByCell = std::vector<std::vector<PetscReal>>;
+  struct Kept { ///< multipliers of a stage that looks back at one where the displacement is looked at
+    PetscReal factor;
+    std::vector<VecHandle> adjoint;
+  };
+
+  PetscErrorCode setup(std::size_t count);
+  PetscErrorCode visit(const Sweep &sweep, const Sweep::Solved &stage);
+  PetscErrorCode add_solver(const Sweep::Solved &stage);
+  PetscErrorCode add_time(const Sweep &sweep, const Sweep::Solved &stage);
+  PetscErrorCode add_space(const Sweep::Solved &stage);
+  /// Stages, and by how much their weight in a better rate of @p stage exceeds that in its own, 1/s.
+  std::vector<std::pair<PetscInt, PetscReal>> better_rate(PetscInt number);
+  PetscErrorCode total(const ByCell &parts, std::vector<PetscReal> &sums) const;
+
+  const Scene &scene_;
+  Model &model_;
+  Simulation &simulation_;
+  const Trajectory &trajectory_;
+  bool gas_ = false, time_resolved_ = true;
+  std::optional<Enrichment> flow_, tissue_;
+  std::map<PetscInt, PetscReal> sampled_;       ///< stages where the displacement is looked at, and whom they stand for
+  std::map<PetscInt, std::vector<Kept>> later_; ///< [stage]
+  std::vector<PetscReal> volumes_;              ///< [stage], mm^3
+  std::vector<LackingParts> lacking_;
+  ByCell solver_, time_, flow_part_, tissue_part_, in_space_;
+  VecHandle state_; ///< local
+};
+
+} // namespace pulmo

@@ -1,0 +1,273 @@
+#include "pulmo/adjoint/error_parts.hpp"
+
+#include "pulmo/base/units.hpp"
+#include "pulmo/mesh/mesh.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+namespace pulmo {
+
+namespace {
+
+/// The displacement is looked at in one of so many stages, and in so many at least.
+constexpr PetscInt stages_a_sample = 12, least_samples = 5;
+
+using ByCell = std::vector<std::vector<PetscReal>>;
+
+void add(PetscReal factor, const ByCell &parts, ByCell &sums)
+{
+  for (std::size_t k = 0; k < parts.size(); ++k)
+    for (std::size_t c = 0; c < parts[k].size(); ++c) sums[k][c] += factor * parts[k][c];
+}
+
+/// Weights of values at times @p t in the derivative at t[at] of the polynomial through them.
+std::vector<PetscReal> derivative_weights(const std::vector<PetscReal> &t, std::size_t at)
+{
+  std::vector<PetscReal> weights(t.size(), 0);
+  for (std::size_t i = 0; i < t.size(); ++i) {
+    if (i == at) continue;
+    weights[at] += 1 / (t[at] - t[i]);
+    PetscReal product = 1 / (t[i] - t[at]);
+    for (std::size_t j = 0; j < t.size(); ++j)
+      if (j != i && j != at) product *= (t[at] - t[j]) / (t[i] - t[j]);
+    weights[i] = product;
+  }
+  return weights;
+}
+
+} // namespace
+
+std::string ErrorParts::obstacle(const Scene &scene, const Model &model)
+{
+  const std::string sweep = Sweep::obstacle(scene, model);
+  if (!sweep.empty()) return sweep;
+  const Composition &composition = model.composition();
+  if (!Enrichment::exists(composition.elements())) return "needs richer elements than the run's: give -elements P2-P1";
+  if (!composition.memories().empty())
+    return "does not know richer elements for what -" + composition.memories().front().effect + " remembers";
+  return "";
+}
+
+std::vector<double> ErrorParts::kinks() const
+{
+  const auto &stages = trajectory_.stages();
+  std::vector<double> times;
+  for (const StageRecord &record : stages) {
+    const double begin = stages[static_cast<std::size_t>(record.phase_start)].time,
+                 ramp = scene_.facts().ventilator->phases()[static_cast<std::size_t>(record.phase)].ramp;
+    if (ramp > 0 && (times.empty() || times.back() != begin + ramp)) times.push_back(begin + ramp);
+  }
+  return times;
+}
+
+PetscErrorCode ErrorParts::setup(std::size_t count)
+{
+  const auto &stages = trajectory_.stages();
+  const auto last = static_cast<PetscInt>(stages.size()) - 1;
+  const auto cells = static_cast<std::size_t>(model_.assembly().cells());
+  const PetscInt samples = std::min(last, std::max(least_samples, last / stages_a_sample));
+  PetscInt fields;
+
+  PetscFunctionBeginUser;
+  PetscCall(DMGetNumFields(model_.dm(), &fields));
+  gas_ = fields > pressure;
+  lacking_.assign(count, {});
+  for (ByCell *part : {&solver_, &time_, &flow_part_, &tissue_part_})
+    part->assign(count, std::vector<PetscReal>(cells, 0));
+  PetscCall(DMCreateLocalVector(model_.dm(), state_.out()));
+  if (gas_) PetscCall(flow_.emplace(pressure).setup(model_));
+  PetscCall(tissue_.emplace(displacement).setup(model_));
+  // a stage in the middle of as many groups of stages, and the time of its group over its own
+  for (PetscInt s = 0; s < samples; ++s) {
+    const PetscInt begin = 1 + last * s / samples, end = 1 + last * (s + 1) / samples;
+    if (begin == end) continue;
+    PetscReal time = 0;
+    for (PetscInt n = begin; n < end; ++n) time += 1 / stages[static_cast<std::size_t>(n)].stage.slope;
+    const PetscInt middle = (begin + end) / 2;
+    sampled_[middle] = time * stages[static_cast<std::size_t>(middle)].stage.slope;
+  }
+  volumes_.assign(stages.size(), 0);
+  for (std::size_t n = 1; n < stages.size(); ++n) {
+    Measures measures;
+    if (stages[n].row >= 0) {
+      volumes_[n] = simulation_.rows()[static_cast<std::size_t>(stages[n].row)].volume * units::mm3_per_ml;
+      continue;
+    }
+    PetscCall(trajectory_.state(static_cast<PetscInt>(n), state_));
+    PetscCall(model_.measure(state_, measures));
+    volumes_[n] = measures.volume_change;
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+std::vector<std::pair<PetscInt, PetscReal>> ErrorParts::better_rate(PetscInt number)
+{
+  const auto &stages = trajectory_.stages();
+  const StageRecord &record = stages[static_cast<std::size_t>(number)];
+  const Phase &phase = scene_.facts().ventilator->phases()[static_cast<std::size_t>(record.phase)];
+  const PetscReal begin = stages[static_cast<std::size_t>(record.phase_start)].time, kink = begin + phase.ramp,
+                  nothing = 1e-6 / record.stage.slope;
+  const std::size_t wanted = simulation_.scheme().order() + 2;
+  // stages from one kink to the next: of the phase, on one side of its ramp's end
+  const auto window = [&](bool whole) {
+    std::vector<PetscInt> list;
+    for (PetscInt n = record.phase_start; n < static_cast<PetscInt>(stages.size()); ++n) {
+      const StageRecord &r = stages[static_cast<std::size_t>(n)];
+      if (n > record.phase_start && r.phase_start != record.phase_start) break;
+      const bool ramp = record.time <= kink + nothing;
+      if (whole || (ramp ? r.time <= kink + nothing : r.time >= kink - nothing)) list.push_back(n);
+    }
+    return list;
+  };
+  std::vector<PetscInt> list = window(false);
+  if (list.size() < wanted) {
+    time_resolved_ = false;
+    list = window(true);
+  }
+  std::map<PetscInt, PetscReal> weights;
+  if (list.size() >= 2) {
+    const std::size_t n = std::min(wanted, list.size()),
+                      at = static_cast<std::size_t>(std::find(list.begin(), list.end(), number) - list.begin()),
+                      before = std::min(at, n - 2), first = std::min(at - before, list.size() - n);
+    std::vector<PetscReal> t;
+    for (std::size_t i = 0; i < n; ++i) t.push_back(stages[static_cast<std::size_t>(list[first + i])].time);
+    const std::vector<PetscReal> better = derivative_weights(t, at - first);
+    for (std::size_t i = 0; i < n; ++i) weights[list[first + i]] += better[i];
+    weights[number] -= record.stage.slope;
+    for (int i = 0; i < 2; ++i)
+      if (record.past[i] >= 0) weights[record.past[i]] -= record.weight[i];
+  }
+  return {weights.begin(), weights.end()};
+}
+
+/// Without airflow: else the richer pressure has it.
+PetscErrorCode ErrorParts::add_solver(const Sweep::Solved &stage)
+{
+  ByCell parts;
+
+  PetscFunctionBeginUser;
+  PetscCall(model_.weighted_residual(false, stage.record.time, stage.state, stage.rate, stage.adjoint, parts));
+  add(1, parts, solver_);
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode ErrorParts::add_time(const Sweep &sweep, const Sweep::Solved &stage)
+{
+  const StageRecord &record = stage.record;
+  const auto changes = better_rate(stage.number);
+  PetscReal flow = 0;
+  ByCell parts;
+
+  PetscFunctionBeginUser;
+  for (const auto &[number, weight] : changes) {
+    flow += weight * volumes_[static_cast<std::size_t>(number)];
+    if (!gas_) continue;
+    PetscCall(trajectory_.state(number, state_));
+    PetscCall(model_.weighted_volume(state_, stage.adjoint, parts));
+    add(weight * model_.row_scale(pressure), parts, time_);
+  }
+  for (std::size_t k = 0; k < lacking_.size(); ++k) lacking_[k].time += stage.by_flow[k] * flow;
+  if (!sweep.other_rates()) PetscFunctionReturn(PETSC_SUCCESS);
+  VecHandle better; // of a multistep stage: the gas does not see it
+  Stage told = record.stage;
+  told.multistep = true;
+  PetscCall(VecDuplicate(state_, better.out()));
+  PetscCall(VecCopy(stage.rate, better));
+  for (const auto &[number, weight] : changes) {
+    PetscCall(trajectory_.state(number, state_));
+    PetscCall(VecAXPY(better, weight, state_));
+  }
+  PetscCall(model_.set_step(told, record.airway.pressure, record.airway.flow));
+  PetscCall(model_.weighted_residual(false, record.time, stage.state, better, stage.adjoint, parts));
+  add(1, parts, time_);
+  PetscCall(model_.weighted_residual(false, record.time, stage.state, stage.rate, stage.adjoint, parts));
+  add(-1, parts, time_);
+  PetscCall(model_.set_step(record.stage, record.airway.pressure, record.airway.flow));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode ErrorParts::add_space(const Sweep::Solved &stage)
+{
+  const StageRecord &record = stage.record;
+  std::vector<Enrichment::Later> later;
+  std::vector<Enrichment::Past> past;
+  VecHandle states[2];
+
+  PetscFunctionBeginUser;
+  for (int i = 0; gas_ && record.stage.multistep && i < 2; ++i) {
+    if (record.past[i] < 0) continue;
+    PetscCall(VecDuplicate(state_, states[i].out()));
+    PetscCall(trajectory_.state(record.past[i], states[i]));
+    past.push_back({record.weight[i] * model_.row_scale(pressure), states[i]});
+  }
+  if (flow_) PetscCall(flow_->add(stage, later, past, simulation_.matrix(), 1, flow_part_, &solver_));
+  for (int i = 0; gas_ && i < 2; ++i) {
+    if (record.past[i] < 0 || sampled_.count(record.past[i]) == 0) continue;
+    Kept kept{record.weight[i] * model_.row_scale(pressure), {}};
+    for (const Vec z : stage.adjoint) {
+      VecHandle copy;
+      PetscCall(VecDuplicate(z, copy.out()));
+      PetscCall(VecCopy(z, copy));
+      kept.adjoint.push_back(std::move(copy));
+    }
+    later_[record.past[i]].push_back(std::move(kept));
+  }
+  const auto sample = sampled_.find(stage.number);
+  if (sample == sampled_.end()) PetscFunctionReturn(PETSC_SUCCESS);
+  for (const Kept &kept : later_[stage.number])
+    later.push_back({kept.factor, {kept.adjoint.begin(), kept.adjoint.end()}});
+  PetscCall(tissue_->add(stage, later, past, simulation_.matrix(), sample->second, tissue_part_, nullptr));
+  later_.erase(stage.number);
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode ErrorParts::visit(const Sweep &sweep, const Sweep::Solved &stage)
+{
+  const StageRecord &record = stage.record;
+
+  PetscFunctionBeginUser;
+  PetscCall(model_.set_step(record.stage, record.airway.pressure, record.airway.flow));
+  if (!flow_) PetscCall(add_solver(stage));
+  PetscCall(add_time(sweep, stage));
+  PetscCall(add_space(stage));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode ErrorParts::total(const ByCell &parts, std::vector<PetscReal> &sums) const
+{
+  PetscFunctionBeginUser;
+  sums.clear();
+  for (const std::vector<PetscReal> &cells : parts) {
+    sums.push_back(0);
+    for (const PetscReal part : cells) sums.back() += part;
+  }
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, sums.data(), static_cast<PetscMPIInt>(sums.size()), MPIU_REAL, MPI_SUM,
+                             PetscObjectComm((PetscObject)model_.dm())));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode ErrorParts::run(Sweep &sweep, const std::vector<Functional> &functionals, PetscReal tolerance,
+                               std::string &failure)
+{
+  std::vector<PetscReal> sums;
+
+  PetscFunctionBeginUser;
+  PetscCall(setup(functionals.size()));
+  PetscCall(sweep.run(
+      functionals, tolerance, [&](const Sweep::Solved &stage) { return visit(sweep, stage); }, failure));
+  PetscCall(total(solver_, sums));
+  for (std::size_t k = 0; k < sums.size(); ++k) lacking_[k].solver += sums[k];
+  PetscCall(total(time_, sums));
+  for (std::size_t k = 0; k < sums.size(); ++k)
+    lacking_[k].time += sums[k] + functionals[k].better_value - functionals[k].value;
+  PetscCall(total(flow_part_, sums));
+  for (std::size_t k = 0; k < sums.size(); ++k) lacking_[k].flow_in_space = sums[k];
+  PetscCall(total(tissue_part_, sums));
+  for (std::size_t k = 0; k < sums.size(); ++k) lacking_[k].tissue_in_space = sums[k];
+  in_space_ = flow_part_;
+  add(1, tissue_part_, in_space_);
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+} // namespace pulmo
