@@ -156,6 +156,59 @@ std::string remembered_name(const MemorySpec &spec, std::size_t index)
   return name;
 }
 
+/// The text of an XDMF file of grids of quadratic tetrahedra, whose values are in HDF5 files.
+class Xdmf {
+public:
+  Xdmf(PetscInt cells, PetscInt nodes) : cells_(cells), nodes_(nodes)
+  {
+    text << "<?xml version=\"1.0\"?>\n<Xdmf Version=\"3.0\">\n<Domain>\n";
+    text.precision(15);
+  }
+  /// A grid on the nodes and cells in @p mesh.
+  void begin(const std::string &name, const std::string &mesh, std::optional<PetscReal> time)
+  {
+    text << " <Grid Name=\"" << name << "\" GridType=\"Uniform\">\n";
+    if (time) text << "  <Time Value=\"" << *time << "\"/>\n";
+    text << "  <Topology TopologyType=\"Tetrahedron_10\" NumberOfElements=\"" << cells_ << "\">";
+    item(mesh, "topology", cells_, 10, "Int");
+    text << "</Topology>\n  <Geometry GeometryType=\"XYZ\">";
+    item(mesh, "geometry", nodes_, 3, "Float");
+    text << "</Geometry>\n";
+  }
+  void at_nodes(const std::string &name, PetscInt columns, const std::string &h5)
+  {
+    attribute(name, "Node", nodes_, columns, h5);
+  }
+  void of_cells(const std::string &name, const std::string &h5) { attribute(name, "Cell", cells_, 1, h5); }
+  void end() { text << " </Grid>\n"; }
+  PetscErrorCode write(MPI_Comm comm, const std::string &path) const
+  {
+    PetscFunctionBeginUser;
+    PetscCall(write_text(comm, text.str() + "</Domain>\n</Xdmf>\n", path));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+
+  std::ostringstream text;
+
+private:
+  void item(const std::string &h5, const std::string &dataset, PetscInt rows, PetscInt columns, const char *type)
+  {
+    text << "<DataItem Format=\"HDF\" NumberType=\"" << type << "\" Precision=\""
+         << (type[0] == 'I' ? sizeof(PetscInt) : 8) << "\" Dimensions=\"" << rows;
+    if (columns > 1) text << " " << columns;
+    text << "\">" << h5 << ":/" << dataset << "</DataItem>";
+  }
+  void attribute(const std::string &name, const char *centre, PetscInt rows, PetscInt columns, const std::string &h5)
+  {
+    text << "  <Attribute Name=\"" << name << "\" AttributeType=\"" << (columns == 3 ? "Vector" : "Scalar")
+         << "\" Center=\"" << centre << "\">";
+    item(h5, name, rows, columns, "Float");
+    text << "</Attribute>\n";
+  }
+
+  PetscInt cells_, nodes_;
+};
+
 /// The file of the snapshot @p index, or of what else belongs to it.
 std::string snapshot_name(PetscInt index, const char *what = "")
 {
@@ -519,54 +572,47 @@ PetscErrorCode FieldWriter::snapshot(PetscReal time, Vec local)
 
 PetscErrorCode FieldWriter::write_index() const
 {
-  const MPI_Comm comm = PetscObjectComm((PetscObject)model_.dm());
-  const std::string file = output_.path("fields.xdmf");
-  PetscMPIInt rank;
-  std::ostringstream f;
+  Xdmf f(n_cells_, n_nodes_);
 
   PetscFunctionBeginUser;
-  PetscCallMPI(MPI_Comm_rank(comm, &rank));
-  if (rank == 0) {
-    const auto item = [&](const char *h5, const char *dataset, PetscInt rows, PetscInt columns, const char *type) {
-      f << "<DataItem Format=\"HDF\" NumberType=\"" << type << "\" Precision=\""
-        << (type[0] == 'I' ? sizeof(PetscInt) : 8) << "\" Dimensions=\"" << rows;
-      if (columns > 1) f << " " << columns;
-      f << "\">" << h5 << ":/" << dataset << "</DataItem>";
-    };
-    f << "<?xml version=\"1.0\"?>\n<Xdmf Version=\"3.0\">\n<Domain>\n"
-      << "<Grid Name=\"lung\" GridType=\"Collection\" CollectionType=\"Temporal\">\n";
-    f.precision(15);
-    for (const Snapshot &s : snapshots_) {
-      const auto attribute = [&](const char *name, const char *centre, PetscInt rows, PetscInt columns,
-                                 const std::string &h5) {
-        f << "  <Attribute Name=\"" << name << "\" AttributeType=\"" << (columns == 3 ? "Vector" : "Scalar")
-          << "\" Center=\"" << centre << "\">";
-        item(h5.c_str(), name, rows, columns, "Float");
-        f << "</Attribute>\n";
-      };
-      const auto of_cells = [&](const char *name) { attribute(name, "Cell", n_cells_, 1, s.file); };
-      f << " <Grid Name=\"step\" GridType=\"Uniform\">\n  <Time Value=\"" << s.time
-        << "\"/>\n  <Topology TopologyType=\"Tetrahedron_10\" NumberOfElements=\"" << n_cells_ << "\">";
-      item(s.mesh.c_str(), "topology", n_cells_, 10, "Int");
-      f << "</Topology>\n  <Geometry GeometryType=\"XYZ\">";
-      item(s.mesh.c_str(), "geometry", n_nodes_, 3, "Float");
-      f << "</Geometry>\n";
-      attribute(displacement_name, "Node", n_nodes_, 3, s.file);
-      for (const char *name : {mean_J_name, least_J_name, hydrostatic_name, von_mises_name}) of_cells(name);
-      attribute(region_name, "Cell", n_cells_, 1, s.mesh);
-      if (scene_.facts().ventilator) of_cells(ventilation_name);
-      if (scene_.facts().airflow) {
-        attribute(pressure_name, "Node", n_nodes_, 1, s.file);
-        of_cells(porosity_name);
-      }
-      if (s.error_indicator) of_cells(tissue_error_name);
-      if (s.error_indicator && scene_.facts().airflow) of_cells(flow_error_name);
-      for (const std::string &name : s.remembered) of_cells(name.c_str());
-      f << " </Grid>\n";
+  f.text << "<Grid Name=\"lung\" GridType=\"Collection\" CollectionType=\"Temporal\">\n";
+  for (const Snapshot &s : snapshots_) {
+    f.begin("step", s.mesh, s.time);
+    f.at_nodes(displacement_name, 3, s.file);
+    for (const char *name : {mean_J_name, least_J_name, hydrostatic_name, von_mises_name}) f.of_cells(name, s.file);
+    f.of_cells(region_name, s.mesh);
+    if (scene_.facts().ventilator) f.of_cells(ventilation_name, s.file);
+    if (scene_.facts().airflow) {
+      f.at_nodes(pressure_name, 1, s.file);
+      f.of_cells(porosity_name, s.file);
     }
-    f << "</Grid>\n</Domain>\n</Xdmf>\n";
+    if (s.error_indicator) f.of_cells(tissue_error_name, s.file);
+    if (s.error_indicator && scene_.facts().airflow) f.of_cells(flow_error_name, s.file);
+    for (const std::string &name : s.remembered) f.of_cells(name, s.file);
+    f.end();
   }
-  PetscCall(write_text(comm, f.str(), file));
+  f.text << "</Grid>\n";
+  PetscCall(f.write(PetscObjectComm((PetscObject)model_.dm()), output_.path("fields.xdmf")));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode FieldWriter::write_cells(const std::string &name,
+                                        const std::vector<std::pair<std::string, std::vector<PetscReal>>> &values)
+{
+  const MPI_Comm comm = PetscObjectComm((PetscObject)model_.dm());
+  ValueFile file(comm);
+
+  PetscFunctionBeginUser;
+  if (!mesh_written_) PetscCall(write_mesh());
+  Xdmf f(n_cells_, n_nodes_);
+  f.begin(name, mesh_, {});
+  for (const auto &[field, cells] : values) {
+    PetscCall(file.write(field, 1, cells));
+    f.of_cells(field, name + ".h5");
+  }
+  f.end();
+  PetscCall(file.close(output_.path(name + ".h5")));
+  PetscCall(f.write(comm, output_.path(name + ".xdmf")));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

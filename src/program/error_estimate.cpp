@@ -367,12 +367,14 @@ PetscErrorCode ErrorEstimate::make(const Options &options, const Output &output,
 PetscErrorCode ErrorEstimate::make_by_sweep(const Options &options, const Scene &scene, Model &model,
                                             Simulation &simulation, const Recording &recording,
                                             const std::vector<SignalRow> &rows,
-                                            const std::vector<ClinicalEntry> &numbers, ErrorReport &report) const
+                                            const std::vector<ClinicalEntry> &numbers, FieldWriter &fields,
+                                            ErrorReport &report) const
 {
   const MPI_Comm comm = options.comm();
   Sweep sweep(scene, model, simulation, recording.trajectory());
   ErrorParts parts(scene, model, simulation, recording.trajectory());
   std::vector<Functional> functionals;
+  std::vector<std::pair<std::string, std::vector<PetscReal>>> in_space;
   PetscLogDouble begin, end;
 
   PetscFunctionBeginUser;
@@ -402,8 +404,10 @@ PetscErrorCode ErrorEstimate::make_by_sweep(const Options &options, const Scene 
                                     [&](const ClinicalEntry &e) { return functionals[k].key == e.key; });
     PetscCheck(entry != numbers.end() && entry->value, PETSC_COMM_SELF, PETSC_ERR_PLIB, "no clinical number %s",
                functionals[k].key.c_str());
+    in_space.emplace_back("lacks_in_space_" + functionals[k].key, parts.in_space()[k]);
     report.bars.push_back(lacking_bar(*entry, parts.lacking()[k], parts.time_resolved() && functionals[k].resolved));
   }
+  if (report.failure.empty() && !functionals.empty()) PetscCall(fields.write_cells("errors", in_space));
   PetscCall(PetscTime(&end));
   report.sweep_seconds = end - begin;
   PetscFunctionReturn(PETSC_SUCCESS);

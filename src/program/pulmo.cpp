@@ -376,8 +376,8 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
     ErrorReport report;
     const std::vector<ClinicalEntry> numbers = regions.numbers(simulation.rows());
     if (error_estimate.sweeps())
-      PetscCall(
-          error_estimate.make_by_sweep(options, scene, run.model(), simulation, recording, rows, numbers, report));
+      PetscCall(error_estimate.make_by_sweep(options, scene, run.model(), simulation, recording, rows, numbers, fields,
+                                             report));
     else
       PetscCall(error_estimate.make(options, output, scene, simulation, numbers, report));
     audits.errors = &report;

@@ -119,6 +119,9 @@ public:
   PetscErrorCode carry_over(const std::string &from);
   /// Writes a snapshot of @p local now.
   PetscErrorCode snapshot(PetscReal time, Vec local);
+  /// Writes values of the cells of this rank, by name, to @p name.h5 and .xdmf.
+  PetscErrorCode write_cells(const std::string &name,
+                             const std::vector<std::pair<std::string, std::vector<PetscReal>>> &values);
 
 private:
   PetscErrorCode number_nodes();

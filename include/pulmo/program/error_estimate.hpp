@@ -7,6 +7,7 @@
 
 namespace pulmo {
 
+class FieldWriter;
 class Model;
 class Output;
 class Recording;
@@ -35,10 +36,12 @@ public:
   PetscErrorCode make(const Options &options, const Output &output, const Scene &scene, const Simulation &simulation,
                       const std::vector<ClinicalEntry> &numbers, ErrorReport &report) const;
 
-  /// The same by a sweep back over the recorded run, whose complete signals are @p rows.
+  /// The same by a sweep back over the recorded run, whose complete signals are @p rows. The part in space goes by
+  /// cells to errors.xdmf, through @p fields.
   PetscErrorCode make_by_sweep(const Options &options, const Scene &scene, Model &model, Simulation &simulation,
                                const Recording &recording, const std::vector<SignalRow> &rows,
-                               const std::vector<ClinicalEntry> &numbers, ErrorReport &report) const;
+                               const std::vector<ClinicalEntry> &numbers, FieldWriter &fields,
+                               ErrorReport &report) const;
 
 private:
   PetscErrorCode choose_method(const Options &options, const Scene &scene, const Model &model, bool restarts);
