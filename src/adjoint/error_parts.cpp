@@ -167,7 +167,7 @@ PetscErrorCode ErrorParts::add_time(const Sweep &sweep, const Sweep::Solved &sta
     PetscCall(model_.weighted_volume(state_, stage.adjoint, parts));
     add(weight * model_.row_scale(pressure), parts, time_);
   }
-  for (std::size_t k = 0; k < lacking_.size(); ++k) lacking_[k].time += stage.by_flow[k] * flow;
+  for (std::size_t k = 0; k < lacking_.size(); ++k) lacking_[k].steps += stage.by_flow[k] * flow;
   if (!sweep.other_rates()) PetscFunctionReturn(PETSC_SUCCESS);
   VecHandle better; // of a multistep stage: the gas does not see it
   Stage told = record.stage;
@@ -259,8 +259,10 @@ PetscErrorCode ErrorParts::run(Sweep &sweep, const std::vector<Functional> &func
   PetscCall(total(solver_, sums));
   for (std::size_t k = 0; k < sums.size(); ++k) lacking_[k].solver += sums[k];
   PetscCall(total(time_, sums));
-  for (std::size_t k = 0; k < sums.size(); ++k)
-    lacking_[k].time += sums[k] + functionals[k].better_value - functionals[k].value;
+  for (std::size_t k = 0; k < sums.size(); ++k) {
+    lacking_[k].steps += sums[k];
+    lacking_[k].rows = functionals[k].better_value - functionals[k].value;
+  }
   PetscCall(total(flow_part_, sums));
   for (std::size_t k = 0; k < sums.size(); ++k) lacking_[k].flow_in_space = sums[k];
   PetscCall(total(tissue_part_, sums));

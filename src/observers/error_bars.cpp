@@ -22,23 +22,23 @@ ErrorBar lacking_bar(const ClinicalEntry &entry, const LackingParts &parts, bool
 {
   const double value = *entry.value, flow = parts.flow_in_space / seen_by_richer,
                tissue = parts.tissue_in_space / seen_by_richer, space = std::abs(flow) + std::abs(tissue),
-               most = largest_part * std::abs(value);
+               time = std::abs(parts.steps) + std::abs(parts.rows), most = largest_part * std::abs(value);
   ErrorBar bar;
 
   bar.entry = entry;
   bar.solver = std::abs(parts.solver);
   if (!time_resolved)
     bar.unresolved = "steps too long for its phases";
-  else if (!(std::abs(parts.time) <= most))
+  else if (!(time <= most))
     bar.unresolved = "steps too long";
   else
-    bar.time = swept_factor * std::abs(parts.time);
+    bar.time = swept_factor * time;
   if (space <= most)
     bar.space = swept_factor * space;
   else
     bar.unresolved += (bar.unresolved.empty() ? "" : ", ") + std::string("cells too large");
   if (!bar.total()) return bar;
-  bar.corrected = value + parts.time + flow + tissue + parts.solver;
+  bar.corrected = value + parts.steps + parts.rows + flow + tissue + parts.solver;
   bar.corrected_error = corrected_share * *bar.total();
   return bar;
 }

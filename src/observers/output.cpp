@@ -116,7 +116,8 @@ PetscErrorCode Output::prepare(const Options &options, const std::string &restar
   if (rank == 0) { // what an earlier run left must not pass for this one's
     std::error_code error;
     std::vector<fs::path> old;
-    for (const char *name : {"scene.json", "summary.json", "failure.json", "signals.csv", "energy.csv", "fields.xdmf"})
+    for (const char *name : {"scene.json", "summary.json", "failure.json", "signals.csv", "energy.csv", "fields.xdmf",
+                             "errors.xdmf", "errors.h5"})
       old.push_back(path(name));
     if (!continues) // else they are replaced whole
       for (const char *name : {"signals.csv.part", "checkpoint.h5", "checkpoint_previous.h5", "checkpoint.h5.part"})

@@ -27,7 +27,9 @@ double space_error(double difference, double ratio);
 
 /// What a number lacks by the discrete adjoint of its run (pulmo/adjoint/error_parts.hpp), in its unit and signed.
 struct LackingParts {
-  double time = 0, flow_in_space = 0, tissue_in_space = 0, solver = 0;
+  double steps = 0; ///< by the rates of the time scheme
+  double rows = 0;  ///< by the few rows that the number is made of
+  double flow_in_space = 0, tissue_in_space = 0, solver = 0;
 };
 
 /// A clinical number with what the discretisation makes it wrong by, each part in the number's unit. A part that could
