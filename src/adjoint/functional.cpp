@@ -13,6 +13,9 @@ namespace {
 
 using Rows = std::vector<SignalRow>;
 
+/// A number below this share of what it is made of is what a solver leaves of nothing.
+constexpr double rounding = 1e-6;
+
 /// What all numbers of a run are made of: its last complete breath, and the row at which the first one began.
 struct Breath {
   const Rows &rows;
@@ -84,9 +87,17 @@ bool is_resolved(const Breath &b, std::size_t i, const std::function<double(cons
   return !first || i == b.last || value(b.rows[i + 1]) > (1 - plain) * value(b.rows[i]);
 }
 
+/// The largest size of @p value in all rows.
+double size(const Breath &b, double SignalRow::*value)
+{
+  double most = 0;
+  for (const SignalRow &r : b.rows) most = std::max(most, std::abs(r.*value));
+  return most;
+}
+
 bool tidal_volume(const Breath &b, Functional &f)
 {
-  if (!b.numbers.takes_in) return false;
+  if (!b.numbers.takes_in || !(b.numbers.tidal_volume > rounding * size(b, &SignalRow::volume))) return false;
   const auto volume = [](const SignalRow &r) { return r.volume; };
   f.value = b.numbers.tidal_volume;
   f.better_value = f.value + rise_between(b, largest(b, volume), volume);
@@ -114,7 +125,7 @@ bool plateau_pressure(const Breath &b, Functional &f)
 
 bool peak_flow(const Breath &b, Functional &f)
 {
-  if (!(b.numbers.peak_flow > 0)) return false;
+  if (!(b.numbers.peak_flow > rounding * size(b, &SignalRow::flow))) return false;
   const auto flow = [](const SignalRow &r) { return r.flow; };
   f.value = b.numbers.peak_flow;
   f.better_value = f.value + rise_between(b, largest(b, flow), flow);
@@ -125,7 +136,7 @@ bool peak_flow(const Breath &b, Functional &f)
 
 bool peak_expiratory_flow(const Breath &b, Functional &f)
 {
-  if (!(b.numbers.peak_expiratory_flow > 0)) return false;
+  if (!(b.numbers.peak_expiratory_flow > rounding * size(b, &SignalRow::flow))) return false;
   const auto outward = [](const SignalRow &r) { return -r.flow; };
   f.value = b.numbers.peak_expiratory_flow;
   f.better_value = f.value + rise_between(b, largest(b, outward), outward);
@@ -185,18 +196,20 @@ bool resistance(const Breath &b, Functional &f)
 bool work(const Breath &b, Functional &f)
 {
   const double peep = b.rows[b.first].machine_pressure(), j = units::kPa_per_cmH2O * 1e-3;
+  double gross = 0;
   f.value = b.numbers.work;
   f.better_value = extrapolated(f.value, overall_numbers(every_other(b.rows, b.kinks)).work);
   for (std::size_t i = b.first + 1; i <= b.last; ++i) {
     const SignalRow &r = b.rows[i], &before = b.rows[i - 1];
     const double mean = (r.machine_pressure() + before.machine_pressure()) / 2 - peep, dV = r.volume - before.volume;
+    gross += std::abs(j * mean * dV);
     f.by_volume[i] += j * mean;
     f.by_volume[i - 1] -= j * mean;
     f.by_pressure[i] += j * dV / 2;
     f.by_pressure[i - 1] += j * dV / 2;
     f.by_pressure[b.first] -= j * dV;
   }
-  return true;
+  return std::abs(f.value) > rounding * gross;
 }
 
 /// A number, and how it is made; false where the run does not define it.

@@ -1,5 +1,7 @@
 #include "pulmo/adjoint/recording.hpp"
 
+#include <algorithm>
+
 namespace pulmo {
 
 PetscErrorCode Recording::declare(Options &options, bool wanted)
@@ -16,8 +18,10 @@ PetscErrorCode Recording::declare(Options &options, bool wanted)
 
 PetscErrorCode Recording::attach(Simulation &simulation, const std::string &folder)
 {
+  const PetscReal most = 1e18; // bytes: what a whole number holds
+
   PetscFunctionBeginUser;
-  trajectory_ = std::make_unique<Trajectory>(static_cast<std::size_t>(memory_ * 1e6), folder);
+  trajectory_ = std::make_unique<Trajectory>(static_cast<std::size_t>(std::min(memory_ * 1e6, most)), folder);
   simulation.record(*trajectory_);
   PetscFunctionReturn(PETSC_SUCCESS);
 }

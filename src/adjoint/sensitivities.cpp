@@ -6,14 +6,18 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 
 namespace pulmo {
 
 namespace {
 
-/// A parameter is moved by this share of itself for the derivative of the residual by it: the quotient is off by as
-/// much as rounding in the residual then.
-constexpr PetscReal difference = 1e-7;
+/// A parameter is moved by this share of its size for the derivative of the residual by it, where it has a part in all
+/// of that; by more where its part is small, and at most by the latter.
+constexpr PetscReal difference = 1e-7, largest_difference = 1e-2;
+
+/// A change of the residual that is smaller than this share of it is rounding, in the main.
+constexpr PetscReal hidden = 1e-13;
 
 /// A parameter of the scene: of kernels, or of the ventilator.
 struct Parameter {
@@ -21,9 +25,21 @@ struct Parameter {
   std::vector<PetscInt> places;  ///< among the constants of kernels (Composition::constant_at); none: the ventilator's
   bool on_facets = false;        ///< nothing in the volume reads it
   bool varies = false;           ///< it differs from place to place
+  PetscReal size = 0;            ///< of its values, wherever they are
+  PetscReal share = difference;  ///< of that, by which it is moved
+  PetscReal effect = 0;          ///< the largest share of the residual that this changes
   std::vector<Phase> less, more; ///< the ventilator's phases with less and more of it
-  PetscReal change() const { return difference * std::abs(*option.target); }
+  PetscReal change() const { return share * size; }
 };
+
+/// The share of a parameter to move it by: rounding of the residual and the curvature over it then spoil the quotient
+/// alike. @p effect: of the residual, that a move by @p share changes.
+PetscReal best_share(PetscReal share, PetscReal effect)
+{
+  if (!std::isfinite(effect)) return difference; // a law's range ends
+  const PetscReal of_all = std::max(effect, PETSC_MACHINE_EPSILON) / share;
+  return std::clamp(std::sqrt(PETSC_MACHINE_EPSILON / of_all), difference, largest_difference);
+}
 
 /// The phases of the ventilator with setting @p option changed by @p change.
 std::vector<Phase> phases_with(const SceneFacts &facts, const Options::RealOption &option, PetscReal change)
@@ -64,15 +80,44 @@ PetscReal target(const StageRecord &record, const std::vector<Phase> &phases)
   return phase.to + (phase.from.value_or(0) - phase.to) * record.airway.share;
 }
 
-/// The parameters of a scene that are not zero and do not differ from place to place. Those that move the ends of
-/// phases are left out: steps land there.
-std::vector<Parameter> parameters_of(const Options &options, const Scene &scene, const Composition &composition)
+/// Whether @p option is one of an effect in the scene.
+bool of_an_effect(const Scene &scene, const std::string &option)
+{
+  const auto effects = scene.active();
+  return std::any_of(effects.begin(), effects.end(), [&](const Effect *effect) {
+    return option.rfind("-" + std::string(effect->name()) + "_", 0) == 0;
+  });
+}
+
+/// The size of what parameter @p p is at its places: between the smallest, zeros aside, and the largest. Collective.
+PetscErrorCode size_of(MPI_Comm comm, const Composition &composition, const Parameter &p, PetscReal &size)
+{
+  const PetscReal one = std::abs(*p.option.target);
+  const ParameterFields *varying = composition.varying();
+  PetscReal least = std::numeric_limits<PetscReal>::infinity(), most = 0;
+
+  PetscFunctionBeginUser;
+  for (std::size_t i = 0; p.varies && i < varying->offsets().size(); ++i)
+    if (std::find(p.places.begin(), p.places.end(), varying->offsets()[i]) != p.places.end())
+      PetscCall(varying->add_sizes(comm, i, least, most));
+  size = most > 0 ? std::sqrt(least) * std::sqrt(most) : one;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// The parameters of a scene. Those that move the ends of phases are left out: steps land there; and those that are
+/// zero. Collective.
+PetscErrorCode find_parameters(const Options &options, const Scene &scene, const Composition &composition,
+                               std::vector<Parameter> &list, std::vector<SensitivityReport::LeftOut> &left_out)
 {
   const SceneFacts &facts = scene.facts();
   std::vector<PetscInt> varying;
-  std::vector<Parameter> list;
+
+  PetscFunctionBeginUser;
   if (composition.varying()) varying = composition.varying()->offsets();
   for (const Options::RealOption &option : options.real_options()) {
+    const auto leave_out = [&](const char *why, bool zero = false) {
+      if (of_an_effect(scene, option.option)) left_out.push_back({option.option, why, zero});
+    };
     Parameter p;
     p.option = option;
     p.on_facets = composition.derived().empty();
@@ -86,15 +131,30 @@ std::vector<Parameter> parameters_of(const Options &options, const Scene &scene,
       p.varies = p.varies || std::find(varying.begin(), varying.end(), place) != varying.end();
       p.on_facets = p.on_facets && composition.read_on_surfaces_alone(owner);
     }
-    if (*option.target == 0 || (composition.varying() && !p.places.empty() && !composition.derived().empty())) continue;
+    PetscCall(size_of(options.comm(), composition, p, p.size));
+    if (p.size == 0) {
+      leave_out("it is zero", true);
+      continue;
+    }
+    if (composition.varying() && !p.places.empty() && !composition.derived().empty()) {
+      leave_out("parameters differ from place to place, and -prestress makes others of them");
+      continue;
+    }
     if (p.places.empty()) {
       p.less = phases_with(facts, option, -p.change());
       p.more = phases_with(facts, option, p.change());
-      if (!same_times(p.less, p.more) || same_targets(p.less, p.more)) continue;
+      if (!same_times(p.less, p.more)) {
+        leave_out("ends of phases or steps move with it");
+        continue;
+      }
+      if (same_targets(p.less, p.more)) {
+        leave_out("no point of the mesh and no phase reads it");
+        continue;
+      }
     }
     list.push_back(std::move(p));
   }
-  return list;
+  PetscFunctionReturn(PETSC_SUCCESS);
 }
 
 using ByCell = std::vector<std::vector<PetscReal>>; ///< [number][cell of this rank]
@@ -104,6 +164,25 @@ PetscErrorCode sum_up(MPI_Comm comm, std::vector<double> &values)
   PetscFunctionBeginUser;
   PetscCallMPI(
       MPI_Allreduce(MPI_IN_PLACE, values.data(), static_cast<PetscMPIInt>(values.size()), MPI_DOUBLE, MPI_SUM, comm));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// The share of residuals times multipliers that is changed, of the number that has the largest.
+PetscErrorCode changed_share(MPI_Comm comm, const ByCell &before, const ByCell &after, PetscReal &share)
+{
+  const std::size_t count = before.size();
+  std::vector<double> sums(2 * count, 0); // what there is of each number, what is changed of it
+
+  PetscFunctionBeginUser;
+  share = 0;
+  for (std::size_t k = 0; k < count; ++k)
+    for (std::size_t c = 0; c < before[k].size(); ++c) {
+      sums[k] += std::abs(before[k][c]);
+      sums[count + k] += std::abs(after[k][c] - before[k][c]);
+    }
+  PetscCall(sum_up(comm, sums));
+  for (std::size_t k = 0; k < count; ++k)
+    if (!(sums[count + k] <= share * sums[k])) share = sums[k] > 0 ? sums[count + k] / sums[k] : 1;
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -121,7 +200,8 @@ PetscErrorCode Sensitivities::declare(Options &options)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Sensitivities::check(const Options &options, const Scene &scene, const Model &model, bool restarts) const
+PetscErrorCode Sensitivities::check(const Options &options, const Scene &scene, const Model &model,
+                                    const StepControl &steps, bool restarts) const
 {
   const std::vector<std::string> known = functional_names();
   std::string list;
@@ -134,10 +214,17 @@ PetscErrorCode Sensitivities::check(const Options &options, const Scene &scene, 
                    "-sensitivities knows no number '%s'; give some of %s", name.c_str(), list.c_str());
   const std::string obstacle = Sweep::obstacle(scene, model);
   PulmoUserCheck(obstacle.empty(), options.comm(), "-sensitivities %s; or leave the option out", obstacle.c_str());
+  PulmoUserCheck(scene.facts().ventilator->breathes(), options.comm(),
+                 "-sensitivities is about the numbers of a breath, and no phase of the programme begins one: name one "
+                 "'inspiration', add the word 'breath' to its line, or leave the option out");
   if (scene.facts().ventilator->may_end_early())
     PetscCall(PetscPrintf(options.comm(),
                           "pulmo: note: -sensitivities: phases that end early by a trigger or by cycling "
                           "are taken to end where they do now, whatever a parameter is\n"));
+  if (steps.in_use())
+    PetscCall(PetscPrintf(
+        options.comm(), "pulmo: note: -sensitivities: steps that are chosen by their error are taken to be as they "
+                        "are now, whatever a parameter is: a run that chooses others differs by its error in time\n"));
   PulmoUserCheck(!restarts, options.comm(),
                  "-sensitivities needs the states of the whole run, and a restart has not those before it; run from "
                  "the start, or leave the option out");
@@ -148,14 +235,15 @@ PetscErrorCode add_derivatives(const Options &options, const Scene &scene, Model
                                const std::vector<Functional> &functionals, PetscReal tolerance,
                                SensitivityReport &report)
 {
-  const std::vector<Parameter> parameters = parameters_of(options, scene, model.composition());
   const std::size_t count = functionals.size();
+  std::vector<Parameter> parameters;
   std::vector<Mesh::Region> regions;
   ByCell all, on_facets, moved; // residuals times multipliers
   PetscMPIInt rank;
 
   PetscFunctionBeginUser;
   PetscCallMPI(MPI_Comm_rank(options.comm(), &rank));
+  PetscCall(find_parameters(options, scene, model.composition(), parameters, report.left_out));
   for (const Functional &f : functionals) report.numbers.push_back({f.key, f.name, f.unit, f.value});
   for (const Parameter &p : parameters)
     report.parameters.push_back(
@@ -175,18 +263,29 @@ PetscErrorCode add_derivatives(const Options &options, const Scene &scene, Model
     PetscCall(residual(stage, false, all));
     PetscCall(residual(stage, true, on_facets));
     for (std::size_t i = 0; i < parameters.size(); ++i) {
-      const Parameter &p = parameters[i];
-      const PetscReal change = p.change();
+      Parameter &p = parameters[i];
+      PetscReal change = p.change();
       if (p.places.empty()) {
         const PetscReal by_parameter = (target(record, p.more) - target(record, p.less)) / (2 * change);
         for (std::size_t k = 0; k < count; ++k)
           report.parameters[i].derivative[k] += rank == 0 ? stage.by_target[k] * by_parameter : 0;
         continue;
       }
-      model.change_parameter(p.places, change);
-      PetscCall(residual(stage, p.on_facets, moved));
-      model.change_parameter({}, 0);
       const ByCell &base = p.on_facets ? on_facets : all;
+      for (int tries = 1;; ++tries) {
+        PetscReal effect;
+        change = p.change();
+        model.change_parameter(p.places, change);
+        PetscCall(residual(stage, p.on_facets, moved));
+        model.change_parameter({}, 0);
+        PetscCall(changed_share(options.comm(), base, moved, effect));
+        const PetscReal best = best_share(p.share, effect);
+        if (tries == 3 || (best < 10 * p.share && p.share < 10 * best)) {
+          p.effect = std::max(p.effect, effect);
+          break;
+        }
+        p.share = best; // for the stages before it, too
+      }
       for (std::size_t k = 0; k < count; ++k)
         for (std::size_t c = 0; c < moved[k].size(); ++c) by_cell[i][k][c] += (moved[k][c] - base[k][c]) / change;
     }
@@ -208,6 +307,11 @@ PetscErrorCode add_derivatives(const Options &options, const Scene &scene, Model
       PetscCall(sum_up(options.comm(), sums));
       row.by_region.emplace_back(region.name, sums);
     }
+  }
+  for (std::size_t i = parameters.size(); i-- > 0;) {
+    if (parameters[i].places.empty() || parameters[i].effect == 0 || parameters[i].effect >= hidden) continue;
+    report.left_out.push_back({parameters[i].option.option, "it is so small that rounding hides what it does", false});
+    report.parameters.erase(report.parameters.begin() + static_cast<std::ptrdiff_t>(i));
   }
   report.solves = static_cast<int>(sweep.solves());
   report.krylov = static_cast<int>(sweep.krylov());

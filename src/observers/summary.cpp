@@ -199,12 +199,13 @@ Json sensitivities_json(const SensitivityReport &report)
     for (const SensitivityReport::Parameter &p : report.parameters) {
       Json &entry = parameters[p.option];
       entry = {{"value", p.value}, {"unit", p.unit}, {"derivative", p.derivative[k]}};
-      // of one value in many one percent says nothing
-      entry["percent_for_one_percent_more"] = p.varies ? Json(nullptr) : Json(report.percent(p, k));
+      entry["percent_for_one_percent_more"] = optional_json(report.percent(p, k));
       for (const auto &[region, derivative] : p.by_region) entry["regions"][region] = derivative[k];
     }
     json["numbers"][report.numbers[k].key] = {{"value", report.numbers[k].value}, {"parameters", parameters}};
   }
+  json["left_out"] = Json::object();
+  for (const SensitivityReport::LeftOut &left_out : report.left_out) json["left_out"][left_out.option] = left_out.why;
   json["not_defined"] = report.undefined;
   json["failure"] = report.failure.empty() ? Json(nullptr) : Json(report.failure);
   json["seconds"] = report.seconds;

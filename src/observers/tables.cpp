@@ -2,6 +2,7 @@
 #include "pulmo/base/units.hpp"
 #include "pulmo/observers/output.hpp"
 
+#include <algorithm>
 #include <cmath>
 
 namespace pulmo {
@@ -202,8 +203,14 @@ PetscErrorCode print_error_bars(MPI_Comm comm, const ErrorReport &report)
 PetscErrorCode print_sensitivities(MPI_Comm comm, const SensitivityReport &report, double run_seconds)
 {
   PetscFunctionBeginUser;
-  for (const std::string &name : report.undefined)
-    PetscCall(PetscPrintf(comm, "pulmo: note: -sensitivities: this run has no %s\n", name.c_str()));
+  std::string undefined;
+  for (const std::string &name : report.undefined) undefined += (undefined.empty() ? "" : ", ") + name;
+  if (!undefined.empty())
+    PetscCall(PetscPrintf(
+        comm,
+        "pulmo: note: -sensitivities: this run has no %s, or no more of it than rounding (docs/clinical.md tells "
+        "when a number is defined)\n",
+        undefined.c_str()));
   if (!report.failure.empty()) {
     PetscCall(PetscPrintf(comm, "pulmo: warning: no sensitivities: %s\n", report.failure.c_str()));
     PetscFunctionReturn(PETSC_SUCCESS);
@@ -217,9 +224,24 @@ PetscErrorCode print_sensitivities(MPI_Comm comm, const SensitivityReport &repor
       continue;
     }
     PetscCall(PetscPrintf(comm, "\n  %-34s %12.5g", p.option.c_str(), p.value));
-    for (std::size_t k = 0; k < report.numbers.size(); ++k)
-      PetscCall(PetscPrintf(comm, " %8.3f", report.percent(p, k)));
+    for (std::size_t k = 0; k < report.numbers.size(); ++k) {
+      const auto percent = report.percent(p, k);
+      PetscCall(percent ? PetscPrintf(comm, " %8.3f", *percent) : PetscPrintf(comm, " %8s", "-"));
+    }
   }
+  // zeros are many, and expected
+  std::vector<std::pair<std::string, std::string>> reasons; // why, and of which
+  for (const SensitivityReport::LeftOut &one : report.left_out) {
+    if (one.zero) continue;
+    const auto known =
+        std::find_if(reasons.begin(), reasons.end(), [&](const auto &reason) { return reason.first == one.why; });
+    if (known == reasons.end())
+      reasons.emplace_back(one.why, one.option);
+    else
+      known->second += ", " + one.option;
+  }
+  for (const auto &[why, options] : reasons)
+    PetscCall(PetscPrintf(comm, "\nNot in the table: %s (%s).", options.c_str(), why.c_str()));
   PetscCall(PetscPrintf(comm, "\nThe sweep took %.3g s beside the %.3g s of the run (%+.0f %%).\n", report.seconds,
                         run_seconds, 100 * report.seconds / run_seconds));
   PetscFunctionReturn(PETSC_SUCCESS);

@@ -195,6 +195,23 @@ PetscErrorCode ParameterFields::take_dataset(Options &options, const Mesh &mesh,
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode ParameterFields::add_sizes(MPI_Comm comm, std::size_t which, PetscReal &least, PetscReal &most) const
+{
+  const Entry &entry = entries_[which];
+  std::vector<PetscReal> values = entry.of_cell;
+
+  PetscFunctionBeginUser;
+  if (values.empty()) values.push_back(entry.everywhere);
+  for (const auto &surface : entry.of_surface) values.push_back(surface.second);
+  for (const PetscReal value : values) {
+    if (value != 0) least = std::min(least, std::abs(value));
+    most = std::max(most, std::abs(value));
+  }
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &least, 1, MPIU_REAL, MPI_MIN, comm));
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &most, 1, MPIU_REAL, MPI_MAX, comm));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscReal ParameterFields::value(const Entry &entry, PetscInt cell, const std::string &surface) const
 {
   if (!surface.empty()) {

@@ -278,7 +278,7 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   PetscCall(look_ahead(comm, scene, run.model(), simulation, run.settle_note()));
   PetscCall(error_estimate.check(options, scene, run.model(), !checkpoint.restart().empty()));
   PetscCall(dry_run.check(options, checkpoint.restart()));
-  PetscCall(sensitivities.check(options, scene, run.model(), !checkpoint.restart().empty()));
+  PetscCall(sensitivities.check(options, scene, run.model(), simulation.step_control(), !checkpoint.restart().empty()));
   if (only_scene) {
     finished = true;
     PetscFunctionReturn(PETSC_SUCCESS);
@@ -321,6 +321,9 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   simulation.add(unused);
   if (dry_run.in_use()) {
     PetscCall(dry_run.make(options, scene, simulation));
+    if (sensitivities.in_use())
+      PetscCall(PetscPrintf(comm, "  The sweep of -sensitivities comes on top: half the time of the run to one and a "
+                                  "half (docs/sensitivities.md).\n"));
     finished = true;
     PetscFunctionReturn(PETSC_SUCCESS);
   }
@@ -363,8 +366,13 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   PetscCall(print_numbers(comm, output, scene, simulation, audits));
   const std::vector<SignalRow> rows = regions.complete(simulation.rows());
   SensitivityReport sensitivity_report;
-  if (sensitivities.in_use() && !asked_to_stop) {
-    PetscCall(sensitivities.make(options, scene, run.model(), simulation, recording, rows, sensitivity_report));
+  if (sensitivities.in_use()) {
+    if (asked_to_stop)
+      sensitivity_report.failure = "the run was asked to stop";
+    else if (complete_breaths(rows).empty())
+      sensitivity_report.failure = why_no_numbers(scene, rows);
+    else
+      PetscCall(sensitivities.make(options, scene, run.model(), simulation, recording, rows, sensitivity_report));
     audits.sensitivities = &sensitivity_report;
     PetscCall(write_summary(options, output, scene, run.model(), simulation, audits, true));
     PetscCall(print_sensitivities(comm, sensitivity_report, simulation.seconds().total));

@@ -21,7 +21,8 @@ public:
   PetscErrorCode declare(Options &options);
   bool in_use() const { return !names_.empty(); }
   /// Refuses what the sweep cannot do, before the run. @p restarts: the run goes on from a checkpoint.
-  PetscErrorCode check(const Options &options, const Scene &scene, const Model &model, bool restarts) const;
+  PetscErrorCode check(const Options &options, const Scene &scene, const Model &model, const StepControl &steps,
+                       bool restarts) const;
   /// After the run, whose complete signals are @p rows.
   PetscErrorCode make(const Options &options, const Scene &scene, Model &model, Simulation &simulation,
                       const Recording &recording, const std::vector<SignalRow> &rows, SensitivityReport &report);

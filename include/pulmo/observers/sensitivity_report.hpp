@@ -2,6 +2,7 @@
 /// How clinical numbers follow the parameters of a scene, as it is told.
 #pragma once
 
+#include <optional>
 #include <string>
 #include <utility>
 #include <vector>
@@ -24,18 +25,26 @@ struct SensitivityReport {
     std::vector<std::pair<std::string, std::vector<double>>> by_region; ///< the same if it changes in that region alone
   };
 
+  /// A parameter without derivatives.
+  struct LeftOut {
+    std::string option, why; ///< why: a sentence without its full stop
+    bool zero = false;
+  };
+
   std::vector<Number> numbers;
   std::vector<Parameter> parameters;
+  std::vector<LeftOut> left_out;
   std::vector<std::string> undefined; ///< names of numbers asked for that the run does not define
   std::string failure;                ///< why there is no result; empty if there is one
   double seconds = 0;                 ///< wall, of the sweep
   int solves = 0, krylov = 0;
 
-  /// By how many percent number @p k changes where parameter @p p grows by one.
-  double percent(const Parameter &p, std::size_t k) const { return percent(p.derivative[k], p, k); }
-  double percent(double derivative, const Parameter &p, std::size_t k) const
+  /// By how many percent number @p k changes where parameter @p p grows by one; empty if it is zero, or if parts of the
+  /// lung have values of their own: of one value in many one percent says nothing.
+  std::optional<double> percent(const Parameter &p, std::size_t k) const
   {
-    return numbers[k].value != 0 ? derivative * p.value / numbers[k].value : 0;
+    if (p.varies || numbers[k].value == 0) return {};
+    return p.derivative[k] * p.value / numbers[k].value;
   }
 };
 

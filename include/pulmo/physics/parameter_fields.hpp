@@ -34,6 +34,9 @@ public:
   /// Puts these values into @p constants.
   void patch(PetscInt cell, const std::string &surface, std::vector<PetscScalar> &constants) const;
 
+  /// Takes the size of each value of the one with number @p which into @p least, zeros aside, and @p most. Collective.
+  PetscErrorCode add_sizes(MPI_Comm comm, std::size_t which, PetscReal &least, PetscReal &most) const;
+
 private:
   struct Entry {
     PetscReal everywhere = 0;

@@ -16,10 +16,13 @@ def build(run):
     if not numbers:
         raise Missing("The run defines none of the numbers that were asked for.")
     options = list(next(iter(numbers.values()))["parameters"])
+    shown = {key: given for key, given in numbers.items() if given["value"] != 0}  # there are no percents of nothing
+    if not shown:
+        raise Missing("The numbers that were asked for are zero.")
     rows = []
     for option in options:
-        of = [given["parameters"][option] for given in numbers.values()]
+        of = [given["parameters"][option] for given in shown.values()]
         percent = [one["percent_for_one_percent_more"] for one in of]
         rows.append({"option": option, "value": number(of[0]["value"]), "unit": of[0]["unit"].replace("H2O", "H₂O"),
                      "values": ["differs by place" if p is None else f"{p:+.2f}".replace("-", "−") for p in percent]})
-    return {"heads": [ROWS[key][0] for key in numbers], "rows": rows, "seconds": number(told["seconds"], 3)}
+    return {"heads": [ROWS[key][0] for key in shown], "rows": rows, "seconds": number(told["seconds"], 3)}
