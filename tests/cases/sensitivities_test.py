@@ -12,7 +12,10 @@ SCENE = (pc.BLOCK + pc.QUIET + pc.PAPER + pc.DIRECT + ["-ts_dt", "0.1", "-snes_r
          ["-tissue", "yoshihara", "-airflow", "-airflow_permeability", "100", "-airflow_surfaces", "x1", "-chest_wall",
           "-chest_wall_surfaces", "x0,y0,y1,z0,z1", "-ventilator", "vcv", "-ventilator_tidal_volume", "200", "-ventilator_ramp_down", "0.3",
           "-ventilator_inspiration", "0.5", "-ventilator_expiration", "0.8", "-energy_audit", "off"])
-ASK = ["-sensitivities", "C_rs,R,PIP,V_T", "-sweep_rtol", "1e-12"]
+STILL = (pc.BLOCK + pc.QUIET + pc.DIRECT + ["-ts_dt", "0.1", "-snes_rtol", "1e-12", "-snes_atol", "1e-12", "-chest_wall",
+                                            "-chest_wall_surfaces", "x0,y0,y1,z0,z1", "-energy_audit", "off"])
+GAS = STILL + ["-airflow", "-airflow_permeability", "1000", "-airflow_surfaces", "x1"]
+ASK = ["-sensitivities", "C_rs,R,PIP,V_T", "-sensitivities_rtol", "1e-12"]
 
 
 def table(case, column="derivative"):
@@ -92,6 +95,83 @@ class Sensitivities(unittest.TestCase):
                          for s in (-1e-3, 1e-3)]
                 self.assertAlmostEqual((moved[1] - moved[0]) / 2e-3, one["regions"]["right_lung"], delta=1e-5 * abs(one["derivative"]))
                 self.assertLess(one["regions"]["right_lung"], -1)
+
+    def test_parameters_of_small_effect(self):
+        """A step of 1e-7 of such a value would be lost in the residual: bigger ones are taken, and what rounding hides is left out."""
+        def derivatives(offset):
+            return table(pc.finished(SCENE + ["-chest_wall_offset", offset] + ASK))
+
+        large, small, none = map(derivatives, ("1e-4", "1e-9", "1e-13"))
+        for key, by in large.items():
+            right = by["-chest_wall_offset"]
+            self.assertAlmostEqual(small[key]["-chest_wall_offset"], right, delta=1e-2 * abs(right) + 1e-6, msg=key)
+            self.assertNotIn("-chest_wall_offset", none[key])
+
+    def test_values_of_very_different_size(self):
+        """What is given for everywhere may be zero, or far from what parts of the lung have: they alone count."""
+        for option, everywhere, body in (("-airflow_permeability", "1e-6", "100"), ("-chest_wall_offset", "0", "1")):
+            with self.subTest(option=option):
+                one = table(pc.finished(SCENE + [option, body] + ASK))
+                other = table(pc.finished(SCENE + [option, f"{everywhere},body={body}"] + ASK))
+                for key, by in one.items():
+                    self.assertAlmostEqual(other[key][option], by[option], delta=1e-6 * abs(by[option]) + 1e-9, msg=key)
+
+    def test_numbers_of_nothing(self):
+        """What a solver leaves of a number has no derivative: work of an elastic lung without airflow, flow out through a closed valve."""
+        elastic = pc.finished(STILL + ["-ventilator", "pcv", "-ventilator_inspiration", "0.5", "-ventilator_expiration", "0.5",
+                                       "-sensitivities", "work,PIP,Q_exp"])
+        self.assertLess(abs(elastic.json()["work_j"]), 1e-9)
+        self.assertEqual(elastic.json()["sensitivities"]["not_defined"], ["work"])
+        self.assertIn("this run has no work, or no more of it than rounding", elastic.out)
+        held = pc.finished(GAS + pc.programme("inspiration 0.3 hold\nfill 0.3 flow 200\nexpiration 0.5 pressure 0\n"
+                                              "inspiration 0.3 flow 200\nexpiration 0.3 hold\n") + ["-sensitivities", "Q_exp,Q_peak"])
+        self.assertEqual(held.json()["sensitivities"]["not_defined"], ["Q_exp"])
+        self.assertEqual(list(held.json()["sensitivities"]["numbers"]), ["peak_flow_ml_per_s"])
+
+    def test_numbers_that_are_zero(self):
+        """There are no percents of nothing, in the table, the summary and the report."""
+        case = pc.finished(GAS + ["-ventilator", "pcv", "-ventilator_pip", "0", "-ventilator_inspiration", "0.4", "-ventilator_expiration", "0.4",
+                                  "-breathing_effort", "-breathing_effort_surfaces", "x0", "-breathing_effort_rise", "0.3",
+                                  "-breathing_effort_period", "0.8", "-sensitivities", "PIP,V_T"])
+        self.assertEqual(set(table(case, "percent_for_one_percent_more")["peak_inspiratory_pressure_cmH2O"].values()), {None})
+        row = next(line for line in case.out.splitlines() if line.startswith("  -tissue_c "))
+        self.assertEqual(row.split()[2], "-")
+        told = pc.tool_called("report", case.directory)
+        self.assertEqual(told.returncode, 0, told.stderr)
+        with open(case.path("report.html"), encoding="utf-8") as f:
+            text = f.read()
+        part = text[text.index("One percent more of a parameter"):]
+        part = part[:part.index("</table>")]
+        self.assertIn("-breathing_effort_pressure", text)
+        self.assertNotIn("differs by place", part)
+        self.assertEqual(part.count('<th scope="col">'), 3)  # parameter, value, V_T
+
+    def test_what_is_left_out(self):
+        case = pc.finished(GAS + ["-ventilator", "pcv", "-ventilator_inspiration", "0.4", "-ventilator_expiration", "0.4", "-tube", "-tube_k1", "3",
+                                  "-gravity", "-support", "-support_rigid", "-sensitivities", "V_T"])
+        left_out = case.json()["sensitivities"]["left_out"]
+        self.assertEqual(left_out["-ventilator_peep"], "it is zero")
+        for option, why in (("-tube_k1", "no point of the mesh and no phase reads it"), ("-gravity_acceleration", "no point of the mesh"),
+                            ("-ventilator_inspiration", "ends of phases or steps move with it")):
+            self.assertIn(why, left_out[option])
+            self.assertRegex(case.out, f"Not in the table: [^.]*{option}[ ,]")
+        self.assertNotIn("-sensitivities_rtol", left_out)
+        self.assertEqual(set(left_out) & set(table(case)["tidal_volume_ml"]), set())
+
+    def test_no_breath(self):
+        """No phase begins one: told before the run. The first one is cut: why, once."""
+        case = pc.Case(GAS + pc.programme("step 0.5 pressure 4\n") + ["-sensitivities", "V_T"])
+        self.assertEqual(case.code, 1, case.tail())
+        self.assertIn("no phase of the programme begins one: name one 'inspiration'", case.err)
+        cut = pc.finished(SCENE + ["-ts_max_time", "0.3"] + ASK)
+        self.assertEqual(cut.out.count("no sensitivities: the run ends within its first breath"), 1)
+        self.assertEqual(cut.json()["sensitivities"]["failure"], "the run ends within its first breath")
+
+    def test_notes(self):
+        steps = pc.finished(SCENE + ["-step_volume_tolerance", "5", "-sensitivities", "V_T", "-sensitivities_memory", "1e300"])
+        self.assertIn("-sensitivities: steps that are chosen by their error are taken to be as they are now", steps.out)
+        self.assertGreater(len(table(steps)["tidal_volume_ml"]), 6)
+        self.assertIn("The sweep of -sensitivities comes on top", pc.finished(SCENE + ASK + ["-dry_run"]).out)
 
     def test_what_is_not_asked_for_is_not_there(self):
         case = pc.finished(SCENE)

@@ -36,7 +36,7 @@ PetscErrorCode run_scene(const std::string &options, bool sweeps, Swept &result)
   PetscCall(sensitivities.declare(run.options()));
   PetscCall(recording.declare(run.options(), sweeps));
   PetscCall(run.setup());
-  PetscCall(sensitivities.check(run.options(), run.scene(), run.model(), false));
+  PetscCall(sensitivities.check(run.options(), run.scene(), run.model(), run.simulation().step_control(), false));
   if (sweeps) PetscCall(recording.attach(run.simulation(), testing::TempDir()));
   PetscCall(run.simulation().run(finished));
   PetscCheck(finished, PETSC_COMM_SELF, PETSC_ERR_LIB, "%s", run.simulation().failure_text().c_str());

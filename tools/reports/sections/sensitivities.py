@@ -25,4 +25,5 @@ def build(run):
         percent = [one["percent_for_one_percent_more"] for one in of]
         rows.append({"option": option, "value": number(of[0]["value"]), "unit": of[0]["unit"].replace("H2O", "H₂O"),
                      "values": ["differs by place" if p is None else f"{p:+.2f}".replace("-", "−") for p in percent]})
-    return {"heads": [ROWS[key][0] for key in shown], "rows": rows, "seconds": number(told["seconds"], 3)}
+    return {"heads": [ROWS[key][0] for key in shown], "rows": rows, "seconds": number(told["seconds"], 3),
+            "left_out": {option: why for option, why in told.get("left_out", {}).items() if why != "it is zero"}}
