@@ -199,10 +199,12 @@ class Sensitivities(unittest.TestCase):
             case = pc.Case(SCENE + ["-ventilator", "off", "-ventilator_tidal_volume", "1", "-sensitivities", "C_rs"])
             self.assertEqual(case.code, 1, case.tail())
         with self.subTest("restart"):
-            half = pc.finished(SCENE + ["-ts_max_time", "0.4", "-checkpoint_every", "0.1"])
+            half = pc.finished(SCENE + ASK + ["-ts_max_time", "0.4", "-checkpoint_every", "0.1"])
             case = pc.Case(SCENE + ["-restart", os.path.join(half.directory, "checkpoint.h5"), "-sensitivities", "C_rs"])
             self.assertEqual(case.code, 1, case.tail())
             self.assertIn("a restart has not those before it", case.err)
+            rest = pc.finished(SCENE + ["-restart", os.path.join(half.directory, "checkpoint.h5")])  # without them it goes on
+            self.assertNotIn("sensitivities", rest.json())
 
 
 if __name__ == "__main__":
