@@ -148,7 +148,8 @@ PetscErrorCode find_parameters(const Options &options, const Scene &scene, const
         continue;
       }
       if (same_targets(p.less, p.more)) {
-        leave_out("no point of the mesh and no phase reads it");
+        if (option.option.rfind("-ventilator_", 0) != 0)
+          leave_out("no point of the mesh reads it"); // else no phase does
         continue;
       }
     }
