@@ -173,7 +173,7 @@ PetscErrorCode Sweep::solve(Vec right, Vec solution, std::string &failure)
     std::ostringstream text;
     text.precision(2);
     text << "the solver leaves " << left / size << " of a linear system of the sweep (" << KSPConvergedReasons[reason]
-         << "); solvers/direct.opts solves whatever the run solved";
+         << "); -options_file petsc_options/solvers/direct.opts solves whatever the run solved";
     failure = text.str();
   }
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -258,6 +258,7 @@ PetscErrorCode Sweep::assemble(const StageRecord &record, PetscInt number)
   const Mat matrix = simulation_.matrix();
   SNES snes;
   PetscInt lag;
+  PetscBool once;
 
   PetscFunctionBeginUser;
   PetscCall(recall(record, number));
@@ -267,10 +268,11 @@ PetscErrorCode Sweep::assemble(const StageRecord &record, PetscInt number)
     PetscCall(VecZeroEntries(column_));
   PetscCall(model_.transposed_jacobian(record.time, x_, rate_, record.stage.slope, matrix));
   PetscCall(KSPSetOperators(ksp_, matrix, matrix));
-  // a preconditioner is kept as long as that of a Jacobian is, for stages of one kind
+  // a preconditioner is kept as long as that of a Jacobian is, for stages of one kind, unless it alone has to solve
+  PetscCall(PetscObjectTypeCompare((PetscObject)ksp_, KSPPREONLY, &once));
   PetscCall(TSGetSNES(simulation_.ts(), &snes));
   PetscCall(SNESGetLagPreconditioner(snes, &lag));
-  const bool same_kind = kept_.slope == record.stage.slope && kept_.mode == record.airway.mode;
+  const bool same_kind = !once && kept_.slope == record.stage.slope && kept_.mode == record.airway.mode;
   kept_ = {same_kind && kept_.age < lag ? kept_.age + 1 : 1, record.stage.slope, record.airway.mode};
   PetscCall(KSPSetReusePreconditioner(ksp_, kept_.age > 1 ? PETSC_TRUE : PETSC_FALSE));
   PetscFunctionReturn(PETSC_SUCCESS);

@@ -55,6 +55,8 @@ class Sensitivities(unittest.TestCase):
         file = pc.finished(SCENE + ASK + ["-sweep_memory", "0"])
         self.same(run, file, 1e-12)
         self.assertEqual([name for name in os.listdir(file.directory) if "trajectory" in name], [])
+        # old factors are enough for Newton's method, and not for the sweep
+        self.same(run, pc.finished(SCENE + pc.options_file("solvers/reuse.opts") + ["-ts_dt", "0.1", "-snes_rtol", "1e-12", "-snes_atol", "1e-12"] + ASK), 1e-6)
         krylov = pc.finished(SCENE[:len(pc.BLOCK + pc.QUIET + pc.PAPER)] + pc.options_file("solvers/iterative.opts") +
                              SCENE[len(pc.BLOCK + pc.QUIET + pc.PAPER + pc.DIRECT):] + ASK)
         self.same(run, krylov, 1e-6)
