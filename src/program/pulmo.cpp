@@ -322,8 +322,9 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   if (dry_run.in_use()) {
     PetscCall(dry_run.make(options, scene, simulation));
     if (sensitivities.in_use())
-      PetscCall(PetscPrintf(comm, "  The sweep of -sensitivities comes on top: half the time of the run to one and a "
-                                  "half (docs/sensitivities.md).\n"));
+      PetscCall(PetscPrintf(comm,
+                            "  The sweep of -sensitivities comes on top: from half as long as the run (one number) to "
+                            "two or three times as long (all eight).\n"));
     finished = true;
     PetscFunctionReturn(PETSC_SUCCESS);
   }
