@@ -66,7 +66,6 @@ PetscErrorCode ErrorParts::setup(std::size_t count)
   const auto &stages = trajectory_.stages();
   const auto last = static_cast<PetscInt>(stages.size()) - 1;
   const auto cells = static_cast<std::size_t>(model_.assembly().cells());
-  const PetscInt samples = std::min(last, std::max(least_samples, last / stages_a_sample));
   PetscInt fields;
 
   PetscFunctionBeginUser;
@@ -78,6 +77,8 @@ PetscErrorCode ErrorParts::setup(std::size_t count)
   PetscCall(DMCreateLocalVector(model_.dm(), state_.out()));
   if (gas_) PetscCall(flow_.emplace(pressure).setup(model_));
   PetscCall(tissue_.emplace(displacement).setup(model_));
+  // without gas each stage stands for itself
+  const PetscInt samples = gas_ ? std::min(last, std::max(least_samples, last / stages_a_sample)) : last;
   // a stage in the middle of as many groups of stages, and the time of its group over its own
   for (PetscInt s = 0; s < samples; ++s) {
     const PetscInt begin = 1 + last * s / samples, end = 1 + last * (s + 1) / samples;

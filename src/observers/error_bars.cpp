@@ -14,31 +14,38 @@ constexpr double factor_of_safety = 1.25, doubtful_factor = 3;
 constexpr double seen_by_richer = 0.75;
 
 /// Of the bar of a sweep: over its parts, of the corrected value over that, and the largest part that is one.
-constexpr double swept_factor = 1.5, corrected_share = 0.5, largest_part = 0.2;
+constexpr double swept_factor = 1.5, corrected_share = 0.5, largest_part = 0.1;
 
 } // namespace
 
-ErrorBar lacking_bar(const ClinicalEntry &entry, const LackingParts &parts, bool time_resolved)
+double space_share(const ClinicalEntry &entry, const LackingParts &parts)
 {
-  const double value = *entry.value, flow = parts.flow_in_space / seen_by_richer,
-               tissue = parts.tissue_in_space / seen_by_richer, space = std::abs(flow) + std::abs(tissue),
-               time = std::abs(parts.steps) + std::abs(parts.rows), most = largest_part * std::abs(value);
+  const double space = (std::abs(parts.flow_in_space) + std::abs(parts.tissue_in_space)) / seen_by_richer;
+  return space == 0 ? 0 : space / std::abs(*entry.value);
+}
+
+ErrorBar lacking_bar(const ClinicalEntry &entry, const LackingParts &parts, double largest_share, bool time_resolved)
+{
+  const double value = *entry.value, time = std::abs(parts.steps) + std::abs(parts.rows),
+               space = space_share(entry, parts);
   ErrorBar bar;
 
   bar.entry = entry;
+  bar.lacks = parts;
   bar.solver = std::abs(parts.solver);
   if (!time_resolved)
     bar.unresolved = "steps too long for its phases";
-  else if (!(time <= most))
+  else if (!(time <= largest_part * std::abs(value)))
     bar.unresolved = "steps too long";
   else
     bar.time = swept_factor * time;
-  if (space <= most)
-    bar.space = swept_factor * space;
+  if (space <= largest_part)
+    bar.space = swept_factor * (1 + std::min(1., largest_share)) * space * std::abs(value);
   else
     bar.unresolved += (bar.unresolved.empty() ? "" : ", ") + std::string("cells too large");
   if (!bar.total()) return bar;
-  bar.corrected = value + parts.steps + parts.rows + flow + tissue + parts.solver;
+  bar.corrected =
+      value + parts.steps + parts.rows + parts.solver + (parts.flow_in_space + parts.tissue_in_space) / seen_by_richer;
   bar.corrected_error = corrected_share * *bar.total();
   return bar;
 }

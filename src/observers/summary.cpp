@@ -167,15 +167,21 @@ Json free_boundary_json(const std::vector<FreeBoundary> &parts)
 Json errors_json(const ErrorReport &report)
 {
   Json json = {{"method", report.method}, {"numbers", Json::object()}};
-  for (const ErrorBar &bar : report.bars)
-    json["numbers"][bar.entry.key] = {{"value", *bar.entry.value},
-                                      {"error", optional_json(bar.total())},
-                                      {"time", optional_json(bar.time)},
-                                      {"time_order", optional_json(bar.time_order)},
-                                      {"space", optional_json(bar.space)},
-                                      {"solver", optional_json(bar.solver)},
-                                      {"corrected", optional_json(bar.corrected)},
-                                      {"corrected_error", optional_json(bar.corrected_error)}};
+  for (const ErrorBar &bar : report.bars) {
+    Json &number = json["numbers"][bar.entry.key];
+    number = {{"value", *bar.entry.value},         {"error", optional_json(bar.total())},
+              {"time", optional_json(bar.time)},   {"time_order", optional_json(bar.time_order)},
+              {"space", optional_json(bar.space)}, {"solver", optional_json(bar.solver)}};
+    if (!bar.lacks) continue;
+    number["corrected"] = optional_json(bar.corrected);
+    number["corrected_error"] = optional_json(bar.corrected_error);
+    number["not_resolved"] = bar.unresolved.empty() ? Json(nullptr) : Json(bar.unresolved);
+    number["lacks"] = {{"steps", bar.lacks->steps},
+                       {"rows", bar.lacks->rows},
+                       {"flow_in_space", bar.lacks->flow_in_space},
+                       {"tissue_in_space", bar.lacks->tissue_in_space},
+                       {"solver", bar.lacks->solver}};
+  }
   json["runs"] = Json::array();
   for (const ErrorLevel &level : report.levels) {
     Json run = {{"name", level.name},      {"dt_s", level.dt},     {"cells", level.cells},

@@ -399,14 +399,20 @@ PetscErrorCode ErrorEstimate::make_by_sweep(const Options &options, const Scene 
   PulmoFailureCheck(!sweep.stopped(), comm,
                     "stopped by %s while the errors were estimated; the run itself is whole, without error bars",
                     signal.name());
+  std::vector<ClinicalEntry> entries;
+  double largest_share = 0;
   for (std::size_t k = 0; k < functionals.size(); ++k) {
     const auto entry = std::find_if(numbers.begin(), numbers.end(),
                                     [&](const ClinicalEntry &e) { return functionals[k].key == e.key; });
     PetscCheck(entry != numbers.end() && entry->value, PETSC_COMM_SELF, PETSC_ERR_PLIB, "no clinical number %s",
                functionals[k].key.c_str());
+    entries.push_back(*entry);
+    largest_share = std::max(largest_share, space_share(*entry, parts.lacking()[k]));
     in_space.emplace_back("lacks_in_space_" + functionals[k].key, parts.in_space()[k]);
-    report.bars.push_back(lacking_bar(*entry, parts.lacking()[k], parts.time_resolved() && functionals[k].resolved));
   }
+  for (std::size_t k = 0; k < functionals.size(); ++k)
+    report.bars.push_back(
+        lacking_bar(entries[k], parts.lacking()[k], largest_share, parts.time_resolved() && functionals[k].resolved));
   if (report.failure.empty() && !functionals.empty()) PetscCall(fields.write_cells("errors", in_space));
   PetscCall(PetscTime(&end));
   report.sweep_seconds = end - begin;

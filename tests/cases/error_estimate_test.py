@@ -13,7 +13,8 @@ SCENE = (pc.BLOCK + pc.DIRECT + pc.QUIET + pc.PAPER +
           "-chest_wall_surfaces", "x0,y0,y1,z0,z1", "-ventilator", "pcv", "-ventilator_pip", "8", "-ventilator_inspiration", "0.8",
           "-ventilator_expiration", "0.8", "-ventilator_ramp", "0.2", "-ventilator_ramp_down", "0.2", "-energy_audit", "off"])
 STEPS = ["-ts_dt", "0.05"]
-ESTIMATE = ["-error_estimate"]
+ESTIMATE = ["-error_estimate", "-error_estimate_method", "runs"]
+SWEEP = ["-error_estimate", "-error_estimate_method", "sweep"]
 BDF2 = ["-ts_type", "bdf"]
 NUMBERS = ["tidal_volume_ml", "peak_flow_ml_per_s", "peak_expiratory_flow_ml_per_s", "compliance_ml_per_cmH2O",
            "resistance_cmH2O_s_per_l", "time_constant_s", "work_j", "auto_peep_cmH2O",
@@ -154,6 +155,11 @@ class ErrorEstimate(unittest.TestCase):
                 self.assertIn(word, case.err)
             return case
 
+        said(SCENE + ["-error_estimate_numbers", "V_T"], "-error_estimate_numbers", "-error_estimate")
+        said(SCENE + SWEEP + ["-error_estimate_numbers", "V_T,tau"], "-error_estimate_numbers", "'tau'")
+        said(SCENE + ESTIMATE + ["-error_estimate_numbers", "V_T"], "-error_estimate_numbers", "method sweep")
+        said(SCENE + SWEEP + ["-elements", "P3-P2"], "-error_estimate_method sweep", "-elements P2-P1")
+        said(SCENE + SWEEP + ["-error_estimate_mesh", pc.mesh("cube.msh")], "-error_estimate_method sweep", "-error_estimate_mesh")
         said(SCENE + ["-error_estimate_mesh", "x.msh"], "-error_estimate_mesh x.msh", "-error_estimate")
         case = said(SCENE + ESTIMATE + ["-error_estimate_mesh", "none.msh"], "-error_estimate_mesh none.msh", "no such file")
         self.assertFalse(os.path.exists(case.directory))
@@ -162,6 +168,114 @@ class ErrorEstimate(unittest.TestCase):
         for mesh, words in ((pc.mesh("cube_coarse.msh"), "as large as"), (pc.mesh("cube_msh22_ascii.msh"), "x1")):
             case = said(SCENE + ["-ts_dt", "0.2"] + ESTIMATE + ["-error_estimate_mesh", mesh], words)
             self.assertFalse(os.path.exists(case.directory), "known before the run")
+
+
+class SweptErrors(unittest.TestCase):
+    """-error_estimate_method sweep."""
+
+    def compared(self, estimate, truth, part):
+        """[(key, value, error, bar)] of the numbers that the estimate has; prints them."""
+        rows = []
+        for key, bar in estimate.items():
+            if truth.get(key) is None or abs(truth[key] - bar["value"]) < 1e-7 * abs(bar["value"]):
+                continue  # prescribed
+            rows.append((key, bar["value"], abs(truth[key] - bar["value"]), bar[part]))
+            print("  {:34} {:12.6g} error {:9.3g} bar {}".format(*rows[-1]))
+        return rows
+
+    def test_bars_in_time(self):
+        fine = pc.finished(SCENE + BDF2 + ["-ts_dt", "0.0015625"]).json()
+        for scheme in ([], BDF2):
+            print("\ntime:", *scheme)
+            rows = self.compared(bars(pc.finished(SCENE + STEPS + scheme + SWEEP)), fine, "time")
+            self.assertGreaterEqual(len(rows), 6)
+            held = [bar >= error for *_, error, bar in rows if bar is not None]
+            self.assertGreaterEqual(len(held), 5)
+            self.assertGreaterEqual(sum(held), 0.8 * len(held))
+
+    def test_bars_in_space(self):
+        """On 24 cells: what has a bar is held by it, and what has none is far off."""
+        for law in ("yoshihara", "ma", "patte"):
+            print("\nspace, 24 cells:", law)
+            steps = ["-ts_dt", "0.2", "-tissue", law, "-ventilator_pip", "4"]
+            truth = pc.finished(SCENE + steps + ["-dm_refine", "2"]).json()
+            for key, value, error, bar in self.compared(bars(pc.finished(SCENE + steps + SWEEP)), truth, "space"):
+                if bar is None:
+                    self.assertGreater(error, 0.1 * abs(value), key)
+                else:
+                    self.assertGreaterEqual(bar, error, key)
+                    self.assertLessEqual(bar, 6 * error, key)
+
+    def test_peak_pressure_of_a_prescribed_flow(self):
+        """The airway's pressure is an unknown, with a tube before it; both parts against finer runs."""
+        flow = [o for o in SCENE if o not in ("-ventilator_pip", "8")]
+        flow[flow.index("pcv")] = "vcv"
+        for more in (["-ventilator_flow_split", "common_pressure"], ["-tube", "-tube_k1", "2", "-tube_k2", "5"]):
+            scene = flow + ["-ventilator_tidal_volume", "30", *more, "-dm_refine", "1"]
+            estimate = bars(pc.finished(scene + STEPS + SWEEP + ["-error_estimate_numbers", "PIP"]))["peak_inspiratory_pressure_cmH2O"]
+            value, lacks = estimate["value"], estimate["lacks"]
+            for lack, finer in (("steps", BDF2 + ["-ts_dt", "0.0125"]), ("flow_in_space", STEPS + ["-dm_refine", "2"])):
+                error = pc.finished(scene + finer).json()["peak_inspiratory_pressure_cmH2O"] - value
+                found = lacks["steps"] + lacks["rows"] if lack == "steps" else lacks["flow_in_space"] + lacks["tissue_in_space"]
+                print(f"PIP {value:.6g}, {lack}: error {error:.4g}, found {found:.4g}", *more)
+                if abs(error) > 1e-4 * value:
+                    self.assertGreater(found / error, 0.5)
+                    self.assertLess(found / error, 2)
+
+    def test_what_the_solver_left(self):
+        """A run that hardly solves its equations: the solver's part is what a tight run has more."""
+        loose = pc.finished(SCENE + STEPS + SWEEP + ["-snes_rtol", "1e-2", "-snes_atol", "1e-4", "-snes_stol", "0"])
+        tight = pc.finished(SCENE + STEPS + ["-snes_rtol", "1e-12", "-snes_atol", "1e-12"]).json()
+        for key in ("tidal_volume_ml", "compliance_ml_per_cmH2O", "peak_flow_ml_per_s"):
+            bar = bars(loose)[key]
+            error = tight[key] - bar["value"]
+            self.assertGreater(abs(error), 1e-7 * tight[key], "the run is loose")
+            self.assertAlmostEqual(bar["lacks"]["solver"], error, delta=0.1 * abs(error))
+
+    def test_ranks_and_cells(self):
+        """The same on any number of ranks; the cells of errors.xdmf add up to the part in space."""
+        import h5py
+
+        one = pc.finished(SCENE + STEPS + SWEEP)
+        for ranks in (2, 3):
+            more = pc.finished(SCENE + STEPS + SWEEP, ranks=ranks)
+            for key, bar in bars(one).items():
+                for name, lack in bar["lacks"].items():
+                    self.assertAlmostEqual(lack, bars(more)[key]["lacks"][name], delta=1e-6 * abs(bar["value"]), msg=key + name)
+        with h5py.File(one.path("errors.h5")) as file:
+            for key, bar in bars(one).items():
+                cells = file["lacks_in_space_" + key][()]
+                self.assertEqual(len(cells), 24)
+                whole = bar["lacks"]["flow_in_space"] + bar["lacks"]["tissue_in_space"]
+                self.assertAlmostEqual(cells.sum(), whole, delta=1e-9 * abs(bar["value"]))
+
+    def test_without_airflow(self):
+        """No gas to flow: the tissue's part alone."""
+        scene = pc.BLOCK + pc.DIRECT + pc.QUIET + [
+            "-tissue", "birzle", "-chest_wall", "-chest_wall_surfaces", "x0,y0,y1,z0,z1", "-lumen_pressure", "off", "-ventilator", "pcv",
+            "-ventilator_pip", "8", "-ventilator_inspiration", "0.8", "-ventilator_expiration", "0.8", "-ventilator_ramp", "0.2",
+            "-ventilator_ramp_down", "0.2", "-ts_dt", "0.1", "-energy_audit", "off"]
+        bar = bars(pc.finished(scene + ["-dm_refine", "1"] + SWEEP))["tidal_volume_ml"]
+        error = pc.finished(scene + ["-dm_refine", "2"]).json()["tidal_volume_ml"] - bar["value"]
+        self.assertEqual(bar["lacks"]["flow_in_space"], 0)
+        print(f"tissue: error {error:.4g}, found {bar['lacks']['tissue_in_space']:.4g} of {bar['value']:.6g}")
+        self.assertGreater(bar["lacks"]["tissue_in_space"] / error, 0.4)
+        self.assertLess(bar["lacks"]["tissue_in_space"] / error, 2)
+
+    def test_chosen_where_it_holds(self):
+        case = pc.finished(SCENE + STEPS + ["-error_estimate", "-error_estimate_numbers", "C_rs"])
+        self.assertEqual(list(bars(case)), ["compliance_ml_per_cmH2O"])
+        self.assertIn("one sweep back", case.out)
+        other = pc.finished(SCENE + ["-ts_dt", "0.2", "-elements", "P3-P2", "-error_estimate", "-error_estimate_mesh", pc.mesh("cube.msh")])
+        self.assertEqual(other.json()["error_estimate"]["method"], "runs")
+
+    def test_a_jump_has_no_largest_flow(self):
+        """Pressure released at once: the flow of the first step has no limit, and no bar."""
+        scene = [o for o in SCENE]
+        del scene[scene.index("-ventilator_ramp_down"):scene.index("-ventilator_ramp_down") + 2]
+        bar = bars(pc.finished(scene + STEPS + SWEEP))["peak_expiratory_flow_ml_per_s"]
+        self.assertIsNone(bar["time"])
+        self.assertIn("steps too long", bar["not_resolved"])
 
 
 if __name__ == "__main__":

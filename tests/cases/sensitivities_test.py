@@ -15,7 +15,7 @@ SCENE = (pc.BLOCK + pc.QUIET + pc.PAPER + pc.DIRECT + ["-ts_dt", "0.1", "-snes_r
 STILL = (pc.BLOCK + pc.QUIET + pc.DIRECT + ["-ts_dt", "0.1", "-snes_rtol", "1e-12", "-snes_atol", "1e-12", "-chest_wall",
                                             "-chest_wall_surfaces", "x0,y0,y1,z0,z1", "-energy_audit", "off"])
 GAS = STILL + ["-airflow", "-airflow_permeability", "1000", "-airflow_surfaces", "x1"]
-ASK = ["-sensitivities", "C_rs,R,PIP,V_T", "-sensitivities_rtol", "1e-12"]
+ASK = ["-sensitivities", "C_rs,R,PIP,V_T", "-sweep_rtol", "1e-12"]
 
 
 def table(case, column="derivative"):
@@ -158,7 +158,7 @@ class Sensitivities(unittest.TestCase):
                             ("-ventilator_inspiration", "ends of phases or steps move with it")):
             self.assertIn(why, left_out[option])
             self.assertRegex(case.out, f"Not in the table: [^.]*{option}[ ,]")
-        self.assertNotIn("-sensitivities_rtol", left_out)
+        self.assertNotIn("-sweep_rtol", left_out)
         self.assertEqual(set(left_out) & set(table(case)["tidal_volume_ml"]), set())
 
     def test_no_breath(self):
@@ -171,7 +171,7 @@ class Sensitivities(unittest.TestCase):
         self.assertEqual(cut.json()["sensitivities"]["failure"], "the run ends within its first breath")
 
     def test_notes(self):
-        steps = pc.finished(SCENE + ["-step_volume_tolerance", "5", "-sensitivities", "V_T", "-sensitivities_memory", "1e300"])
+        steps = pc.finished(SCENE + ["-step_volume_tolerance", "5", "-sensitivities", "V_T", "-sweep_memory", "1e300"])
         self.assertIn("-sensitivities: steps that are chosen by their error are taken to be as they are now", steps.out)
         self.assertGreater(len(table(steps)["tidal_volume_ml"]), 6)
         self.assertIn("The sweep of -sensitivities comes on top", pc.finished(SCENE + ASK + ["-dry_run"]).out)

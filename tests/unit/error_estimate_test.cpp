@@ -57,10 +57,49 @@ TEST(SpaceError, HoldsTheErrorOfOrderOneOrMore)
 
 TEST(ErrorBar, IsTheSumOfItsPartsOrUnknown)
 {
-  ErrorBar bar{{"tidal_volume_ml", "tidal volume", "ml", 500}, 1.0, 2.0, 0.25, {}};
+  ErrorBar bar;
+  bar.time = 1;
+  bar.space = 2;
+  bar.solver = 0.25;
   EXPECT_NEAR(*bar.total(), 3.25, 1e-15);
   bar.space.reset();
   EXPECT_FALSE(bar.total());
+}
+
+TEST(LackingBar, CountsPartsThatMayCancelApart)
+{
+  const ClinicalEntry entry{"tidal_volume_ml", "tidal volume", "ml", 500};
+  LackingParts parts;
+  parts.steps = 3;
+  parts.rows = -1;
+  parts.flow_in_space = -6;
+  parts.tissue_in_space = 3;
+  parts.solver = -0.5;
+  const ErrorBar bar = lacking_bar(entry, parts, 0.2, true);
+  EXPECT_NEAR(*bar.time, 1.5 * 4, 1e-12);
+  EXPECT_NEAR(*bar.space, 1.2 * 1.5 * 9 / 0.75, 1e-12);
+  EXPECT_NEAR(*bar.solver, 0.5, 1e-12);
+  EXPECT_NEAR(*bar.corrected, 500 + 2 - 3 / 0.75 - 0.5, 1e-12);
+  EXPECT_NEAR(*bar.corrected_error, *bar.total() / 2, 1e-12);
+  EXPECT_TRUE(bar.unresolved.empty());
+}
+
+TEST(LackingBar, SaysWhatIsNotResolved)
+{
+  const ClinicalEntry entry{"tidal_volume_ml", "tidal volume", "ml", 500};
+  LackingParts parts;
+  parts.flow_in_space = 40; // 53 of 500
+  EXPECT_NEAR(space_share(entry, parts), 40 / 0.75 / 500, 1e-12);
+  ErrorBar bar = lacking_bar(entry, parts, 0.2, true);
+  EXPECT_FALSE(bar.space);
+  EXPECT_FALSE(bar.total());
+  EXPECT_FALSE(bar.corrected);
+  EXPECT_EQ(bar.unresolved, "cells too large");
+  bar = lacking_bar(entry, parts, 0.2, false);
+  EXPECT_FALSE(bar.time);
+  EXPECT_EQ(bar.unresolved, "steps too long for its phases, cells too large");
+  parts.steps = std::nan("");
+  EXPECT_FALSE(lacking_bar(entry, parts, 0.2, true).time);
 }
 
 } // namespace

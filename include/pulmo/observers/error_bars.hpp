@@ -37,8 +37,9 @@ struct LackingParts {
 struct ErrorBar {
   ClinicalEntry entry;
   std::optional<double> time, space, solver;
-  std::optional<double> time_order; ///< observed
-  std::optional<double> corrected;  ///< the value with what it lacks, where its sign is known
+  std::optional<double> time_order;  ///< observed
+  std::optional<LackingParts> lacks; ///< by a sweep
+  std::optional<double> corrected;   ///< the value with what it lacks, where its sign is known
   std::optional<double> corrected_error;
   std::string unresolved; ///< why a part is empty, for one who reads the table
 
@@ -46,12 +47,16 @@ struct ErrorBar {
   std::optional<double> total() const;
 };
 
-/// The bars of @p entry from what it lacks. Of the error in space richer elements take so much as they would of one of
-/// order 1 in h and 2 in their degree, 3/4 from P1 to P2: what a rim leaves. 1.5 times the parts make the bar, those of
-/// flow and tissue counted apart as they may cancel by chance, half of that the bar of the corrected value. A part of
-/// more than a fifth of the number is no small change, and its first order no estimate: it is empty then. @p
-/// time_resolved: the run's phases have enough steps.
-ErrorBar lacking_bar(const ClinicalEntry &entry, const LackingParts &parts, bool time_resolved);
+/// The part in space that @p parts find, as a share of @p entry's value: richer elements see of it what they take of an
+/// error of order 1 in h/p^2, 3/4 from P1 to P2, which is what a rim leaves. Flow and tissue count apart, as they may
+/// cancel by chance.
+double space_share(const ClinicalEntry &entry, const LackingParts &parts);
+
+/// The bars of @p entry from what it lacks: 1.5 times the parts, that in space more by @p largest_share, the largest
+/// space_share() of all numbers of the sweep (1 at most), by which an estimate of first order may be off; half of the
+/// bar is that of the corrected value. A part of more than a tenth of the number is no small change, and empty.
+/// @p time_resolved: the run's phases have enough steps.
+ErrorBar lacking_bar(const ClinicalEntry &entry, const LackingParts &parts, double largest_share, bool time_resolved);
 
 /// One run that the estimate was made from.
 struct ErrorLevel {
