@@ -27,6 +27,7 @@ from shared.keys import lock
 
 from . import page, settings
 from .errors import Axes
+from .goal import Goal
 from .ladder import Ladder
 from .numbers import ALIASES, LEVELS, question
 from .search import Search
@@ -53,6 +54,11 @@ def parse(words):
     parser.add_argument("--question", action="append", default=[], metavar="NAME=1%",
                         help=f"a number and its tolerance (repeatable): {', '.join(ALIASES)} or a key of summary.json; the ladder ends "
                         "as soon as all are answered")
+    parser.add_argument("--method", choices=["ladder", "sweep", "auto"], default="ladder", help=(
+        "how a question is answered: by ladders; by the errors that one sweep back over each run tells, changing what is cheapest; or by "
+        "sweeps where the scene lets them (default ladder)"))
+    parser.add_argument("--no-adapt", dest="adapt", action="store_false",
+                        help="with sweeps on built-in lungs: cells of one size, not by the errors of the run before")
     parser.add_argument("--numbers", nargs="+", metavar="NAME", help="without a question: the numbers that have to be met (default: those of "
                         f"{' '.join(ALIASES)} that the scene has)")
     parser.add_argument("--meshes", type=Path, nargs="+", help="meshes of one body, coarse to fine")
@@ -86,6 +92,8 @@ def parse(words):
         given = getattr(options, name)
         setattr(options, name, given and list(dict.fromkeys(given)))
     options.meshes = options.meshes and list({path.resolve(): path for path in options.meshes}.values())
+    if options.method == "sweep" and not options.asked:
+        fail("--method sweep answers a --question; give one")
     if min(options.repeat, options.ranks) < 1 or min(options.dt_factors) <= 0 or options.adaptive < 0 or (options.refine or 0) < 0:
         fail("--repeat and --ranks must be at least 1, --dt-factors positive, --adaptive and --refine not negative")
     return options
@@ -107,16 +115,35 @@ def axes(options, scene):
     return Axes(meshes, steps, solvers, settings.Setting(meshes[0], first, solvers[0])), spent
 
 
-def prepare(words, origins=None):
-    """The search that the words of a command ask for; no run is made. origins: commands that made the given meshes, by path."""
-    options = parse(words)
-    options.origins = origins or {}
+def by_sweeps(options, words):
+    """The answer to a question by sweeps, in sentences; None where the scene lets none and ladders may take over."""
+    goal = Goal(options.asked, [word for name in options.scene for word in ("-options_file", str(scene_file(name)))], options)
+    if goal.solve():
+        sentences = goal.write(page.command_line(words))
+        print("\n".join(sentences))
+        return sentences
+    if options.method == "sweep" or "-error_estimate_method sweep" not in goal.refused:
+        fail(f"no answer by sweeps: {goal.refused}")
+    print("no sweep is possible here: ladders", flush=True)
+    return None
+
+
+def guard(options):
+    """The words of the scene, once it is known that its options are none of the tool's, and its folders are locked."""
     require(options.build, [])
     scene = [word for name in options.scene for word in ("-options_file", str(scene_file(name)))]
     settings.refuse_ours([*scene, *options.flags], options.elements)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("tools/accuracy_cost: ended; finished runs are kept"))
     for folder in (options.output, options.results):
         lock(folder)
+    return scene
+
+
+def prepare(words, origins=None):
+    """The search that the words of a command ask for; no run is made. origins: commands that made the given meshes, by path."""
+    options = parse(words)
+    options.origins = origins or {}
+    scene = guard(options)
     found, spent = axes(options, scene)
     named = list(options.asked) or [ALIASES.get(name, name) for name in options.numbers or []]
     ladder = Ladder(found, scene, options.flags, options, spent)
@@ -126,6 +153,11 @@ def prepare(words, origins=None):
 def explore(words, origins=None):
     """Makes the runs that the words of a command ask for and writes its folder; the search and its sentences."""
     try:
+        options = parse(words)
+        if options.method != "ladder" and options.asked:
+            guard(options)
+            if by_sweeps(options, words):
+                return None
         search = prepare(words, origins)
         ladder = search.ladder
         search.explore()

@@ -52,18 +52,23 @@ def rows(search, found):
 
 
 def recommended(path, answer, search, command):
-    """An option file of a setting: to be read after the scene and the user's flags, as the run had them: what the flags set is not
-    taken from the solver file, mesh and steps are the setting's."""
+    """The option file of the setting that an answer found."""
     setting, run = answer.run.setting, answer.run
     choice = search.ladder.choice(setting, search.ladder.done[search.axes.base].numbers)
-    solver, given = plain_options(setting.solver.file), names_of(search.ladder.flags)
+    demand = next(d for d in search.demands() if list(d) == answer.keys and max(d.values()) == answer.share)
+    write_setting(path, demand, [f"the cheapest setting that surely meets this, of those tried by\n#   {command}", setting.name,
+                                 f"{run.cpu:.3g} s CPU, {run.wall:.3g} s wall, {run.memory:.0f} MB on {processor()}", f"The mesh: {origin(setting.mesh)}"],
+                  setting.solver.file, search.ladder.flags, choice)
+
+
+def write_setting(path, demand, comments, solver_file, flags, choice):
+    """An option file of a setting: to be read after the scene and the user's flags, as the run had them: what the flags set is not
+    taken from the solver file, mesh and steps are the setting's."""
+    solver, given = plain_options(solver_file), names_of(flags)
     words = [*solver, *choice]
-    demand = "; ".join(f"{short(k)} within {percent(s)}" for k, s in next(d for d in search.demands() if list(d) == answer.keys
-                                                                         and max(d.values()) == answer.share).items())
-    lines = [f"# {demand}: the cheapest setting that surely meets this, of those tried by", f"#   {command}",
-             f"# {setting.name}", f"# {run.cpu:.3g} s CPU, {run.wall:.3g} s wall, {run.memory:.0f} MB on {processor()}",
-             f"# The mesh: {origin(setting.mesh)}",
-             "# Flags that go with it: " + (shlex.join(map(str, search.ladder.flags)) or "none"),
+    asked = "; ".join(f"{short(k)} within {percent(s)}" for k, s in demand.items())
+    lines = [f"# {asked}: {comments[0]}", *(f"# {text}" for text in comments[1:]),
+             "# Flags that go with it: " + (shlex.join(map(str, flags)) or "none"),
              "# Give it after the scene's files and these flags; options that follow it override it."]
     for i, word in enumerate(words):
         if is_option(word) and not (i < len(solver) and word in given):

@@ -134,17 +134,34 @@ def lung_words(size):
     return ["--side", "both", "--size", f"{size:g}", "--airway-size", f"{size / AIRWAY:g}"]
 
 
+class Clock:
+    """Seconds, wall or cpu of programs that were started, of what is done within `with`."""
+
+    def __init__(self, kind):
+        self.kind, self.seconds = kind, 0.0
+
+    def now(self):
+        used = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return time.monotonic() if self.kind == "wall" else used.ru_utime + used.ru_stime
+
+    def __enter__(self):
+        self.begin = self.now()
+        return self
+
+    def __exit__(self, *_):
+        self.seconds = self.now() - self.begin
+
+
 def lung(size, folder, clock):
     """A pair of built-in lungs of a size (mm), made by tools/lung_mesh; and the seconds that took."""
     path = folder / f"pair_{size:g}.msh"
     seconds = folder / f"pair_{size:g}.json"
     if not seconds.exists():
         path.unlink(missing_ok=True)
-    begin, before = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
-    if make_mesh(path, "lung_mesh", lung_words(size)):
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        seconds.write_text(json.dumps({"wall": time.monotonic() - begin,
-                                       "cpu": after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime}) + "\n")
+    with Clock("wall") as wall, Clock("cpu") as cpu:
+        made = make_mesh(path, "lung_mesh", lung_words(size))
+    if made:
+        seconds.write_text(json.dumps({"wall": wall.seconds, "cpu": cpu.seconds}) + "\n")
     return path, json.loads(seconds.read_text())[clock]
 
 

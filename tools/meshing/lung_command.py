@@ -83,7 +83,7 @@ def parse(arguments):
     size.add_argument("--cells", type=count, metavar="N",
                       help="aim at N tetrahedra (within 10 %%) instead of a size")
     parser.add_argument("--size-field", metavar="FILE.xdmf", help=(
-        "let the sizes follow the error indicators in the fields.xdmf of a run (-output_fields_error_indicator) on a "
+        "let the sizes follow the errors of a run: errors.xdmf (-error_estimate), or fields.xdmf (-output_fields_error_indicator), on a "
         "mesh of the same lungs; as many tetrahedra as there unless --cells is given"))
     parser.add_argument("--airway", choices=list(AIRWAY_SIZE),
                         help="a hilum patch, a carved main bronchus, or carved lobar bronchi too (default: main)")

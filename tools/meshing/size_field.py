@@ -12,6 +12,7 @@ from .sizes import SIZE_GROWTH
 
 # indicator in a run's fields -> order of the gradients in it: of P2 displacement, of P1 pressure
 INDICATORS = {"error_indicator_J": 2, "error_indicator_flux_W": 1}
+LACKS = "lacks_in_space_"  # what a number lacks by -error_estimate: a product of two gradients of P1 pressure
 SIZE_CHANGE = (0.25, 2)  # least and largest ratio of new to old size
 
 
@@ -75,7 +76,7 @@ def graded(points, tets, sizes):
 
 
 def read_size_field(path):
-    """The SizeField of a run's fields.xdmf; its snapshots on the last mesh are added up."""
+    """The SizeField of a run's fields.xdmf or errors.xdmf; its snapshots on the last mesh are added up."""
     import h5py
 
     def dataset(item, more=""):
@@ -88,21 +89,25 @@ def read_size_field(path):
         mesh = grids[-1].find("Topology/DataItem").text
         points = dataset(grids[-1].find("Geometry/DataItem"))
         tets = dataset(grids[-1].find("Topology/DataItem")).reshape(-1, 10)[:, :4]
-        energies, whole = {}, 0
+        energies, lacks, whole = {}, [], 0
         for grid in grids:
             if grid.find("Topology/DataItem").text != mesh:
                 continue
             for attribute in grid.iter("Attribute"):
                 name, item = attribute.get("Name"), attribute.find("DataItem")
+                if name.startswith(LACKS):
+                    lacks.append(np.abs(dataset(item)))
                 if name in INDICATORS:
                     energies[name] = energies.get(name, 0) + dataset(item)
                 if name == "error_indicator_J":
                     whole = whole + dataset(item, "_whole")
     except (OSError, KeyError, IndexError, ValueError, AttributeError, xml.etree.ElementTree.ParseError) as error:
-        raise MeshError(f"--size-field {path} is not the fields.xdmf of a run with its HDF5 files ({error}).") from error
+        raise MeshError(f"--size-field {path} is not the fields.xdmf or errors.xdmf of a run with its HDF5 files ({error}).") from error
     errors = [(energies[name] / total, INDICATORS[name])
               for name, total in zip(INDICATORS, np.atleast_1d(whole)) if name in energies and total > 0]
+    errors += [(lack / lack.sum(), 1) for lack in lacks if lack.sum() > 0]
     if not errors:
-        raise MeshError(f"--size-field {path} holds no error indicator: run with -output_fields_error_indicator.")
+        raise MeshError(f"--size-field {path} holds no errors: give the errors.xdmf of a run with -error_estimate, or "
+                        "the fields.xdmf of one with -output_fields_error_indicator.")
     corners, tets = np.unique(tets, return_inverse=True)
     return SizeField(points[corners], tets.reshape(-1, 4), errors)

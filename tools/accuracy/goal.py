@@ -1,0 +1,283 @@
+"""Answers a question by sweeps: each run tells its error in time and in space, and what is cheapest to change comes next."""
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from benchmarks import runs
+from shared.common import fail, processor
+from shared.keys import make_mesh
+
+from . import page, settings
+from .numbers import SHORT, file_name, percent, short
+
+FIRST_SIZE = 30                 # mm, of the built-in lungs
+FINER = (0.9, 0.75, 0.6, 0.5)   # what sizes of cells and steps may be changed by at once
+ORDER_IN_SPACE = 1.5            # of a number in the size of the cells, until two meshes tell
+ORDERS_BELIEVED = (1.0, 3.0)    # what two meshes may tell
+ROWS, BDF2 = 1.0, 0.3           # order of the sums over rows; share of the steps' part that BDF2 leaves at first
+COST_OF_BDF2 = 1.3              # of a step
+GROWTH = 1.1                    # exponent of the cost of a step over cells
+MARGIN = 0.8                    # a prediction aims at so much of what is allowed
+MOST_RUNS = 12
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A setting. size: relative size of the cells. field: errors.xdmf that they follow; mesh, refined: a file that is there."""
+    size: float
+    dt: float
+    scheme: str = "beuler"
+    field: str = ""
+    mesh: str = ""
+    refined: int = 0
+
+    @property
+    def name(self):
+        what = f"{Path(self.mesh).stem}{f' refined {self.refined} x' if self.refined else ''}" if self.mesh else (
+            f"size {self.size:.3g} mm" + (", by the errors of the run before" if self.field else ""))
+        return f"{what} | {settings.Steps(self.scheme, self.dt).name}"
+
+
+@dataclass
+class Outcome:
+    choice: Choice
+    run: dict
+    parts: dict  # number -> what the sweep says of it
+
+    @property
+    def cells(self):
+        return self.run["summary"]["cells"]
+
+    def corrected(self, key):
+        """The value with all that it lacks, resolved or not."""
+        part = self.parts[key]
+        lacks = part["lacks"]
+        return part["value"] + lacks["steps"] + lacks["rows"] + lacks["solver"] + (lacks["flow_in_space"] + lacks["tissue_in_space"]) / SEEN
+
+
+class Goal:
+    """asked: number -> share."""
+
+    def __init__(self, asked, scene, options):
+        self.asked, self.scene, self.options = asked, scene, options
+        self.spent, self.outcomes, self.refused = 0.0, [], ""
+        if unknown := [key for key in asked if key not in SWEPT]:
+            fail(f"--method sweep has no error of {', '.join(map(short, unknown))}; it has {', '.join(map(short, SWEPT))}")
+
+    # ------------------------------------------------------------ runs
+
+    def words(self, choice):
+        o = self.options
+        start = [] if o.ranks == 1 else [*o.launcher.split(), str(o.ranks)]
+        mesh = self.mesh(choice)
+        return [*start, o.build / "pulmo", *self.scene, "-options_file", str(self.solver()), *o.flags, *self.chosen(choice, mesh),
+                "-error_estimate_method", "sweep"]
+
+    def solver(self):
+        return settings.solvers(self.options)[0].file
+
+    def chosen(self, choice, mesh):
+        """The options of a choice."""
+        return ["-dm_plex_filename", str(mesh), *(["-dm_refine", str(choice.refined)] if choice.refined else []),
+                *(["-elements", self.options.elements[0]] if self.options.elements[0] else []),
+                *settings.Steps(choice.scheme, choice.dt).words(0, 0), "-error_estimate",
+                "-error_estimate_numbers", ",".join(SWEPT[key] for key in self.asked)]
+
+    def mesh(self, choice):
+        if choice.mesh:
+            return choice.mesh
+        folder = self.options.results / "meshes"
+        if not choice.field:
+            path, seconds = settings.lung(choice.size, folder.parent, self.options.clock)
+            self.spent += 0 if path in self.made else seconds
+            self.made.add(path)
+            return path
+        cells = round(self.last.cells * (self.last.choice.size / choice.size) ** 3)
+        path = folder / f"goal_{Path(choice.field).parent.parent.name}_{cells}.msh"
+        with settings.Clock(self.options.clock) as clock:
+            make_mesh(path, "lung_mesh", ["--side", "both", "--size-field", choice.field, "--cells", cells])
+        self.spent += clock.seconds
+        return path
+
+    def attempt(self, choice):
+        """Runs a choice; True if it is done."""
+        print(f"[{len(self.outcomes) + 1}] {choice.name}: " + (f"about {self.predict(choice):.0f} s, " if self.outcomes else "")
+              + f"{max(0, self.options.budget - self.spent):.0f} of {self.options.budget:.0f} s left", flush=True)
+        longest = max(1.0, self.options.budget - self.spent) * (1 if self.options.clock == "wall" else 4)
+        run = runs.measured([*self.words(choice), "-output_dir"], self.options.results / "runs", 0, self.options.ranks, longest)
+        self.spent += run[self.options.clock]
+        if run["code"]:
+            self.refused = run["reason"]
+            print(f"    failed: {run['reason']}", flush=True)
+            return False
+        estimate = run["summary"].get("error_estimate") or {}
+        if lacking := [short(key) for key in self.asked if key not in estimate.get("numbers", {})]:
+            fail(f"the scene has no {', '.join(lacking)}" + (f": {estimate['failure']}" if "failure" in estimate else ""))
+        self.outcomes.append(Outcome(choice, run, estimate["numbers"]))
+        for key in self.asked:
+            print(f"    {self.value(key)}", flush=True)
+        return True
+
+    @property
+    def last(self):
+        return self.outcomes[-1]
+
+    def geometry(self, key):
+        """What the shape of the cells' facets makes a number wrong by: meshes that follow the body anew differ in it, and their corrected
+        values in nothing else. Of order 2; 0 for a mesh from a file, whose facets are the body; infinite after one mesh."""
+        if self.last.choice.mesh:
+            return 0.0
+        now = self.last
+        before = next((o for o in reversed(self.outcomes[:-1]) if o.choice.size > 1.05 * now.choice.size), None)
+        if not before:
+            return math.inf
+        ratio = (now.choice.size / before.choice.size) ** 2
+        return abs(now.corrected(key) - before.corrected(key)) * ratio / (1 - ratio)
+
+    def bar(self, key):
+        """Of the corrected value; infinite where a part is not resolved."""
+        error = self.last.parts[key]["corrected_error"]
+        return math.inf if error is None else error + self.geometry(key)
+
+    def share(self, key):
+        return self.bar(key) / abs(self.last.corrected(key))
+
+    def value(self, key):
+        """C_rs = 82.3 +- 0.6, in words."""
+        part = self.last.parts[key]
+        if part["corrected"] is None:
+            return f"{short(key)} = {part['value']:.5g}, not resolved: {part['not_resolved']}"
+        if math.isinf(self.bar(key)):
+            return f"{short(key)} = {part['corrected']:.5g} ± {part['corrected_error']:.2g} on these facets; another mesh tells what they make of the body"
+        return f"{short(key)} = {part['corrected']:.5g} ± {self.bar(key):.2g} ({100 * self.share(key):.2g} %; the run itself has {part['value']:.5g})"
+
+    # ------------------------------------------------------------ what comes next
+
+    def order_in_space(self, key):
+        """Of a number in the size of the cells, by the last two runs that differ in it."""
+        now = self.last
+        before = next((o for o in reversed(self.outcomes[:-1]) if o.cells < 0.9 * now.cells), None)
+        if not before:
+            return ORDER_IN_SPACE
+        a, b = (sum(abs(o.parts[key]["lacks"][part]) for part in ("flow_in_space", "tissue_in_space")) for o in (before, now))
+        if min(a, b) <= 0:
+            return ORDER_IN_SPACE
+        return min(max(math.log(a / b) / math.log((now.cells / before.cells) ** (1 / 3)), ORDERS_BELIEVED[0]), ORDERS_BELIEVED[1])
+
+    def promised(self, key, choice):
+        """The share that the bar of a number would have by what the last run tells."""
+        part, now = self.last.parts[key], self.last.choice
+        lacks, finer, shorter = part["lacks"], choice.size / now.size, choice.dt / now.dt
+        order = settings.ORDERS[choice.scheme]
+        steps = abs(lacks["steps"]) * shorter ** order * (1 if choice.scheme == now.scheme else BDF2)
+        space = (abs(lacks["flow_in_space"]) + abs(lacks["tissue_in_space"])) / SEEN * finer ** self.order_in_space(key)
+        value, geometry = self.last.corrected(key), self.geometry(key)
+        if math.isinf(geometry) and finer > 0.9:
+            return math.inf
+        geometry = 0 if math.isinf(geometry) else geometry * finer ** 2
+        if part["not_resolved"] and "for its phases" in part["not_resolved"] and shorter > 0.5:
+            return math.inf
+        share = max((steps + abs(lacks["rows"]) * shorter ** ROWS) / abs(value), space / abs(value))
+        if share > LARGEST:
+            return math.inf
+        return geometry / abs(value) + FACTOR * (steps + abs(lacks["rows"]) * shorter ** ROWS + (1 + space / abs(value)) * space) / abs(value) + abs(lacks["solver"] / value)
+
+    def predict(self, choice):
+        """Seconds of a choice with its sweep, by the last run."""
+        if not self.outcomes:
+            return 0.0
+        now = self.last
+        work = (now.choice.size / choice.size) ** (3 * GROWTH) * now.choice.dt / choice.dt
+        scheme = COST_OF_BDF2 if choice.scheme != now.choice.scheme else 1
+        return now.run[self.options.clock] * work * scheme
+
+    def next(self):
+        """The cheapest choice that promises what is asked, or the one that comes nearest to it."""
+        now = self.last.choice
+        field = ""
+        if not now.mesh and self.options.adapt:
+            field = str(self.last.run["folder"] / "run" / "errors.xdmf")
+        found = []
+        for finer in (1, *FINER, 0.4, 0.3, 0.25):
+            if now.mesh:
+                level = round(-math.log2(finer))
+                if abs(2.0 ** -level - finer) > 1e-9:
+                    continue
+                there = replace(now, refined=now.refined + level, size=now.size * finer)
+            else:
+                there = replace(now, size=now.size * finer, field=field if finer < 1 else now.field)
+            for shorter in (1, *FINER, 0.35, 0.25, 0.18, 0.125):
+                for scheme in dict.fromkeys((now.scheme, "bdf")):
+                    choice = replace(there, dt=now.dt * shorter, scheme=scheme)
+                    if choice != now:
+                        found.append(choice)
+        worst = {c: max(self.promised(key, c) / (MARGIN * share) for key, share in self.asked.items()) for c in found}
+        met = [c for c in found if worst[c] <= 1]
+        if met:
+            return min(met, key=self.predict)
+        # what is not resolved tells no more than that both have to be finer
+        bounded = [c for c in found if c.size >= now.size / 2 - 1e-9 and c.dt >= now.dt / 2 - 1e-9]
+        return min(bounded, key=lambda c: (worst[c] * self.predict(c) ** 0.3 if math.isfinite(worst[c]) else 1e9, c.size * c.dt))
+
+    def met(self):
+        return bool(self.outcomes) and all(self.share(key) <= share for key, share in self.asked.items())
+
+    def solve(self):
+        """Runs until the bars are within what is asked, or the budget is used. False: no sweep is possible here."""
+        self.made = set()
+        o = self.options
+        dt = o.dt or float(settings.of_files([*self.scene, *o.flags], "-ts_dt", "0.05"))
+        if o.meshes or settings.of_files([*self.scene, *o.flags], "-dm_plex_filename") and not o.lung:
+            path = str((o.meshes or [settings.of_files([*self.scene, *o.flags], "-dm_plex_filename")])[0])
+            choice = Choice(1.0, dt, mesh=path)
+        else:
+            choice = Choice(max(o.lung or [FIRST_SIZE]), dt)
+        while self.attempt(choice):
+            if self.met() or len(self.outcomes) >= MOST_RUNS:
+                return True
+            choice = self.next()
+            if self.spent + self.predict(choice) > o.budget:
+                print(f"{choice.name} would take about {self.predict(choice):.0f} s: more than the budget leaves", flush=True)
+                return True
+        return bool(self.outcomes)
+
+    def sentences(self):
+        texts = []
+        for key, share in self.asked.items():
+            texts.append(f"{'' if self.met() else 'NOT within ' + percent(share) + ': '}{self.value(key)}; {self.last.run[self.options.clock]:.3g} s "
+                         f"with its sweep, {self.spent:.3g} s in all ({self.options.clock})")
+        tenth = Goal(dict.fromkeys(self.asked, 0), self.scene, self.options)
+        tenth.outcomes, tenth.asked = self.outcomes, {key: share / 10 for key, share in self.asked.items()}
+        choice = tenth.next()
+        texts.append(f"{', '.join(f'{short(k)} within {percent(s)}' for k, s in tenth.asked.items())} would take about "
+                     f"{tenth.predict(choice):.2g} s ({choice.name})" if all(
+                         tenth.promised(k, choice) <= s for k, s in tenth.asked.items()) else "a tenth of that is out of reach from here")
+        return texts
+
+    def write(self, command):
+        """The folder: README.md and, where the question is answered, the options of the last run."""
+        folder, share = self.options.output, max(self.asked.values())
+        for old in folder.glob("recommended_*.opts"):
+            old.unlink()
+        sentences = self.sentences()
+        lines = ["# What accuracy costs", "", f"    {command}", "", *(f"- {text}" for text in sentences), "",
+                 "Each run was followed by one sweep back over it (-error_estimate_method sweep), which tells its errors; value ± bar is the corrected value, on the facets of its mesh.",
+                 "", "| setting | cells | steps | s | " + " | ".join(short(k) for k in self.asked) + " |", "|" + "---|" * (4 + len(self.asked))]
+        for o in self.outcomes:
+            cells = []
+            for key in self.asked:
+                p = o.parts[key]
+                cells.append(f"{p['corrected']:.5g} ± {p['corrected_error']:.2g}" if p["corrected"] is not None else f"{o.corrected(key):.5g}, {p['not_resolved']}")
+            lines.append(f"| {o.choice.name} | {o.cells} | {o.run['summary']['steps']} | {o.run[self.options.clock]:.3g} | " + " | ".join(cells) + " |")
+        (folder / "README.md").write_text("\n".join(lines) + "\n")
+        if self.met():
+            page.write_setting(folder / file_name(share), self.asked, [
+                f"corrected value and bar of a run with its sweep, found by\n#   {command}", self.last.choice.name,
+                f"{self.last.run['cpu']:.3g} s CPU, {self.last.run['wall']:.3g} s wall, {self.last.run['memory']:.0f} MB on {processor()}"],
+                self.solver(), self.options.flags, self.chosen(self.last.choice, self.mesh(self.last.choice)))
+        print(f"wrote {folder / 'README.md'}\n")
+        return sentences
+
+
+SWEPT = {**SHORT, "plateau_pressure_cmH2O": "P_plat", "peak_expiratory_flow_ml_per_s": "Q_exp", "work_j": "work"}
+SEEN, FACTOR, LARGEST = 0.75, 0.75, 0.1  # as in pulmo/observers/error_bars.hpp; the bar of a corrected value over its parts
