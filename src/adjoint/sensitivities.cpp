@@ -19,6 +19,10 @@ constexpr PetscReal difference = 1e-7, largest_difference = 1e-2;
 /// A change of the residual that is smaller than this share of it is rounding, in the main.
 constexpr PetscReal hidden = 1e-13;
 
+/// The same for one of an effect that remembers: what it does in a step is small, and adds up over many, so that
+/// rounding would count. It is moved both ways then.
+constexpr PetscReal larger_difference = 1e-6;
+
 /// A parameter of the scene: of kernels, or of the ventilator.
 struct Parameter {
   Options::RealOption option;
@@ -29,6 +33,7 @@ struct Parameter {
   PetscReal share = difference;  ///< of that, by which it is moved
   PetscReal effect = 0;          ///< the largest share of the residual that this changes
   std::vector<Phase> less, more; ///< the ventilator's phases with less and more of it
+  bool adds_up = false;          ///< an effect reads it that remembers
   PetscReal change() const { return share * size; }
 };
 
@@ -130,7 +135,9 @@ PetscErrorCode find_parameters(const Options &options, const Scene &scene, const
       p.places.push_back(place);
       p.varies = p.varies || std::find(varying.begin(), varying.end(), place) != varying.end();
       p.on_facets = p.on_facets && composition.read_on_surfaces_alone(owner);
+      p.adds_up = p.adds_up || composition.remembers(owner);
     }
+    if (p.adds_up) p.share = larger_difference;
     PetscCall(size_of(options.comm(), composition, p, p.size));
     if (p.size == 0) {
       leave_out("it is zero", true);
@@ -239,7 +246,7 @@ PetscErrorCode add_derivatives(const Options &options, const Scene &scene, Model
   const std::size_t count = functionals.size();
   std::vector<Parameter> parameters;
   std::vector<Mesh::Region> regions;
-  ByCell all, on_facets, moved; // residuals times multipliers
+  ByCell all, on_facets, moved, less; // residuals times multipliers
   PetscMPIInt rank;
 
   PetscFunctionBeginUser;
@@ -251,49 +258,61 @@ PetscErrorCode add_derivatives(const Options &options, const Scene &scene, Model
         {p.option.option, p.option.unit, *p.option.target, p.varies, std::vector<double>(count, 0), {}});
   std::vector<ByCell> by_cell(
       parameters.size(), ByCell(count, std::vector<PetscReal>(static_cast<std::size_t>(model.assembly().cells()), 0)));
-  const auto residual = [&](const Sweep::Solved &stage, bool facets, ByCell &sums) -> PetscErrorCode {
-    const StageRecord &record = stage.record;
+  // by the parameters of kernels; @p residual: what they act in, times the multipliers
+  const auto move_parameters = [&](bool adapts, const auto &residual) -> PetscErrorCode {
     PetscFunctionBeginUser;
-    PetscCall(model.set_step(record.stage, record.airway.pressure, record.airway.flow));
-    PetscCall(model.weighted_residual(facets, record.time, stage.state, stage.rate, stage.adjoint, sums));
-    PetscFunctionReturn(PETSC_SUCCESS);
-  };
-  const auto visit = [&](const Sweep::Solved &stage) -> PetscErrorCode {
-    const StageRecord &record = stage.record;
-    PetscFunctionBeginUser;
-    PetscCall(residual(stage, false, all));
-    PetscCall(residual(stage, true, on_facets));
+    PetscCall(residual(false, all));
+    PetscCall(residual(true, on_facets));
     for (std::size_t i = 0; i < parameters.size(); ++i) {
       Parameter &p = parameters[i];
-      PetscReal change = p.change();
-      if (p.places.empty()) {
-        const PetscReal by_parameter = (target(record, p.more) - target(record, p.less)) / (2 * change);
-        for (std::size_t k = 0; k < count; ++k)
-          report.parameters[i].derivative[k] += rank == 0 ? stage.by_target[k] * by_parameter : 0;
-        continue;
-      }
-      const ByCell &base = p.on_facets ? on_facets : all;
+      if (p.places.empty()) continue;
+      const auto residual_with = [&](PetscReal by, ByCell &sums) -> PetscErrorCode {
+        PetscFunctionBeginUser;
+        model.change_parameter(p.places, by);
+        PetscCall(residual(p.on_facets, sums));
+        model.change_parameter({}, 0);
+        PetscFunctionReturn(PETSC_SUCCESS);
+      };
+      const ByCell *base = p.on_facets ? &on_facets : &all;
       for (int tries = 1;; ++tries) {
         PetscReal effect;
-        change = p.change();
-        model.change_parameter(p.places, change);
-        PetscCall(residual(stage, p.on_facets, moved));
-        model.change_parameter({}, 0);
-        PetscCall(changed_share(options.comm(), base, moved, effect));
-        const PetscReal best = best_share(p.share, effect);
+        PetscCall(residual_with(p.change(), moved));
+        if (!adapts) break;
+        PetscCall(changed_share(options.comm(), *base, moved, effect));
+        const PetscReal best = p.adds_up ? p.share : best_share(p.share, effect); // thresholds are near
         if (tries == 3 || (best < 10 * p.share && p.share < 10 * best)) {
           p.effect = std::max(p.effect, effect);
           break;
         }
         p.share = best; // for the stages before it, too
       }
+      PetscReal change = p.change();
+      if (p.adds_up) {
+        PetscCall(residual_with(-change, less));
+        base = &less;
+        change *= 2;
+      }
       for (std::size_t k = 0; k < count; ++k)
-        for (std::size_t c = 0; c < moved[k].size(); ++c) by_cell[i][k][c] += (moved[k][c] - base[k][c]) / change;
+        for (std::size_t c = 0; c < moved[k].size(); ++c) by_cell[i][k][c] += (moved[k][c] - (*base)[k][c]) / change;
     }
     PetscFunctionReturn(PETSC_SUCCESS);
   };
   sweep.ask_targets();
+  const auto visit = [&](const Sweep::Solved &stage) -> PetscErrorCode {
+    PetscFunctionBeginUser;
+    for (std::size_t i = 0; i < parameters.size() && rank == 0; ++i) {
+      const Parameter &p = parameters[i];
+      if (!p.places.empty()) continue;
+      const PetscReal by_parameter = (target(stage.record, p.more) - target(stage.record, p.less)) / (2 * p.change());
+      for (std::size_t k = 0; k < count; ++k) report.parameters[i].derivative[k] += stage.by_target[k] * by_parameter;
+    }
+    PetscCall(
+        move_parameters(true, [&](bool facets, ByCell &sums) { return sweep.weighted_residual(stage, facets, sums); }));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  };
   if (count > 0) PetscCall(sweep.run(functionals, tolerance, visit, report.failure));
+  if (sweep.wants_start())
+    PetscCall(move_parameters(false, [&](bool facets, ByCell &sums) { return sweep.weighted_start(facets, sums); }));
   PetscCall(scene.mesh().regions(regions));
   for (std::size_t i = 0; i < parameters.size(); ++i) {
     SensitivityReport::Parameter &row = report.parameters[i];

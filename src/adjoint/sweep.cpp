@@ -18,14 +18,16 @@ constexpr PetscReal rounding = 1e-9;
 /// method without iterations, or one that looks at a preconditioned residual, may say so of others.
 constexpr PetscReal loosest = 100, least = 1e-8;
 
+/// Of the modulus: a change of pressure over which few kernels have a kink, and rounding is small.
+constexpr PetscReal curved = 1e-7;
+
 } // namespace
 
 std::string Sweep::obstacle(const Scene &scene, const Model &model)
 {
   const Composition &composition = model.composition();
   if (!model.own_integration()) return "needs pulmo's own integration: leave -petscfe_type out";
-  if (!composition.memories().empty())
-    return "does not know yet how what -" + composition.memories().front().effect + " remembers changes";
+  if (const std::string of_memory = MemorySweep::obstacle(composition); !of_memory.empty()) return of_memory;
   if (composition.n_scalars() > 0)
     return "does not know yet the unknowns of -" + composition.scalar_groups().front().effect;
   if (!scene.facts().ventilator) return "is about the numbers of a breath: it needs -ventilator";
@@ -45,6 +47,7 @@ PetscErrorCode Sweep::setup()
   PetscInt fields;
 
   PetscFunctionBeginUser;
+  if (model_.composition().memory_acts()) memory_ = std::make_unique<MemorySweep>(model_);
   PetscCall(DMGetNumFields(model_.dm(), &fields));
   gas_ = fields > pressure;
   for (VecHandle *v : {&x_, &rate_, &past_, &column_, &border_, &work_, &other_}) PetscCall(create(*v));
@@ -92,18 +95,25 @@ PetscErrorCode Sweep::recall(const StageRecord &record, PetscInt number)
     PetscCall(trajectory_.state(record.past[i], past_));
     PetscCall(VecAXPY(rate_, record.weight[i], past_));
   }
+  if (memory_) {
+    MemorySweep::Values last, earlier;
+    PetscCall(trajectory_.remembered(record.past[0], last));
+    if (record.past[1] >= 0) PetscCall(trajectory_.remembered(record.past[1], earlier));
+    model_.memory()->show(last, earlier);
+  }
   model_.set_load(record.load);
   model_.airway().hold(record.airway.mode != Airway::Mode::free);
   PetscCall(model_.set_step(record.stage, record.airway.pressure, record.airway.flow));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-/// The residual is linear in both, so that a difference over any step is exact.
+/// The residual is linear in both, so that a difference over any step is exact; but what is remembered may follow from
+/// the pressure as it likes.
 PetscErrorCode Sweep::make_column(const StageRecord &record)
 {
   const bool free = record.airway.mode == Airway::Mode::free;
   const PetscReal L = model_.composition().mesh().length(),
-                  change = free ? record.stage.slope * L * L * L : model_.modulus();
+                  change = free ? record.stage.slope * L * L * L : model_.modulus() * (memory_ ? curved : 1);
 
   PetscFunctionBeginUser;
   const auto residual_at = [&](PetscReal by, Vec F) -> PetscErrorCode {
@@ -233,6 +243,77 @@ PetscErrorCode Sweep::look_back(const StageRecord &record, Vec z, std::size_t fu
     PetscCall(trajectory_.state(record.past[i], past_));
     PetscCall(model_.add_volume_gradient(past_, z, record.weight[i] * scale, before.state));
   }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Sweep::want_by_memory(const StageRecord &record, std::vector<Wanted> &want, Pending &pending)
+{
+  std::vector<MemorySweep::OfState> numbers(count_);
+  std::vector<VecHandle> by_rate(count_);
+
+  PetscFunctionBeginUser;
+  for (std::size_t k = 0; k < count_; ++k) {
+    if (want[k].memory.empty()) continue;
+    if (!want[k].state) PetscCall(create(want[k].state));
+    PetscCall(create(by_rate[k]));
+    numbers[k] = {want[k].weights(), want[k].state, by_rate[k], 0};
+  }
+  PetscCall(memory_->by_state(record.time, x_, rate_, numbers));
+  for (std::size_t k = 0; k < count_; ++k) {
+    if (want[k].memory.empty()) continue;
+    want[k].pressure += numbers[k].by_pressure;
+    for (int i = 0; i < 2; ++i) {
+      if (record.past[i] <= 0) continue; // at rest at the start
+      Wanted &before = wanted(pending, record.past[i], k);
+      if (!before.state) PetscCall(create(before.state));
+      PetscCall(VecAXPY(before.state, record.weight[i], by_rate[k]));
+    }
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Sweep::look_back_at_memory(const Solved &stage, Pending &pending)
+{
+  const StageRecord &record = stage.record;
+  std::vector<MemorySweep::OfPast> numbers;
+
+  PetscFunctionBeginUser;
+  PetscCall(model_.set_step(record.stage, record.airway.pressure, record.airway.flow));
+  for (std::size_t k = 0; k < count_; ++k) {
+    MemorySweep::OfPast number{stage.by_memory[k], stage.adjoint[k], nullptr, nullptr};
+    for (int i = 0; i < 2; ++i) {
+      if (record.past[i] < 0) continue;
+      MemorySweep::Values &before = wanted(pending, record.past[i], k).memory;
+      before.resize(model_.memory()->size(), 0);
+      (i == 0 ? number.by_last : number.by_earlier) = &before;
+    }
+    numbers.push_back(number);
+  }
+  PetscCall(memory_->by_past(record.time, x_, rate_, numbers));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Sweep::weighted_residual(const Solved &stage, bool facets, std::vector<std::vector<PetscReal>> &sums)
+{
+  const StageRecord &record = stage.record;
+
+  PetscFunctionBeginUser;
+  PetscCall(model_.set_step(record.stage, record.airway.pressure, record.airway.flow));
+  PetscCall(model_.weighted_residual(facets, record.time, stage.state, stage.rate, stage.adjoint, sums));
+  if (memory_)
+    PetscCall(memory_->add_weighted(facets, false, record.time, stage.state, stage.rate, stage.by_memory, sums));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Sweep::weighted_start(bool facets, std::vector<std::vector<PetscReal>> &sums)
+{
+  std::vector<const MemorySweep::Values *> weights;
+
+  PetscFunctionBeginUser;
+  sums.assign(count_, std::vector<PetscReal>(static_cast<std::size_t>(model_.assembly().cells()), 0));
+  PetscCall(model_.set_step(1, 0)); // as it is when the model is built
+  for (const Wanted &w : start_) weights.push_back(w.weights());
+  PetscCall(memory_->add_weighted(facets, true, 0, nullptr, nullptr, weights, sums));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -415,6 +496,7 @@ PetscErrorCode Sweep::run(const std::vector<Functional> &functionals, PetscReal 
     std::vector<Wanted> want = std::move(found->second);
     pending.erase(found);
     PetscCall(assemble(record, n));
+    if (memory_) PetscCall(want_by_memory(record, want, pending));
     for (std::size_t k = 0; k < count_; ++k) PetscCall(right_side(record, k, want[k], pending, rights[k]));
     PetscCall(model_.airway().close_rows(simulation_.matrix(), false));
     Opening c;
@@ -423,16 +505,21 @@ PetscErrorCode Sweep::run(const std::vector<Functional> &functionals, PetscReal 
       PetscCall(solve_border(c, failure));
     }
     const std::vector<PetscReal> none(count_, 0);
-    Solved result{n, record, x_, rate_, {}, none, none, none, none, none};
-    for (VecHandle &z : adjoint) result.adjoint.push_back(z);
+    Solved result{n, record, x_, rate_, {}, none, none, none, none, none, {}};
+    for (std::size_t k = 0; k < count_; ++k) {
+      result.adjoint.push_back(adjoint[k]);
+      result.by_memory.push_back(want[k].weights());
+    }
     for (std::size_t k = 0; k < count_; ++k) {
       if (want[k].nothing()) // no later row of this number
         PetscCall(VecZeroEntries(adjoint[k]));
       else
         PetscCall(solve_stage(record, c, k, want[k], rights[k], pending, result, failure));
     }
+    if (memory_ && failure.empty()) PetscCall(look_back_at_memory(result, pending));
     if (visit && failure.empty()) PetscCall(visit(result));
   }
+  start_ = std::move(pending[0]);
   PetscCall(KSPSetTolerances(ksp_, relative, absolute, PETSC_DEFAULT, PETSC_DEFAULT));
   PetscFunctionReturn(PETSC_SUCCESS);
 }

@@ -387,6 +387,9 @@ const PetscScalar *Model::constants_at(PetscInt cell, const std::string &surface
   if (!varying) return constants_.data();
   local_constants_ = constants_;
   varying->patch(cell, surface, local_constants_);
+  for (const PetscInt place : change_.places) // over which the place's own was written
+    if (std::find(varying->offsets().begin(), varying->offsets().end(), place) != varying->offsets().end())
+      local_constants_[static_cast<std::size_t>(place)] += change_.by;
   return local_constants_.data();
 }
 

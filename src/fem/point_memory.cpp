@@ -21,6 +21,13 @@ PetscErrorCode PointMemory::setup(const Model &model)
 
 PetscErrorCode PointMemory::begin()
 {
+  PetscFunctionBeginUser;
+  for (Room &r : rooms_) PetscCall(evaluate_start(r, r.last_.data()));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode PointMemory::evaluate_start(const Room &r, PetscScalar *values) const
+{
   PetscSection section;
   PetscInt size;
 
@@ -28,10 +35,40 @@ PetscErrorCode PointMemory::begin()
   PetscCall(DMGetLocalSection(model_->dm(), &section));
   PetscCall(PetscSectionGetStorageSize(section, &size));
   const std::vector<PetscScalar> zero(static_cast<std::size_t>(size), 0);
-  for (Room &r : rooms_) {
-    PetscCall(take_given(r));
-    PetscCall(evaluate(0, zero.data(), nullptr, Step(Stage(1, 0, true)), true, r, r.last_));
+  PetscCall(take_given(r, values));
+  PetscCall(evaluate(0, zero.data(), nullptr, Step(Stage(1, 0, true)), true, r, values));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+void PointMemory::copy(bool start, Values &values) const
+{
+  values.clear();
+  for (const Room &r : rooms_) {
+    const std::vector<PetscScalar> &of = start ? r.last_ : r.next_;
+    values.insert(values.end(), of.begin(), of.end());
   }
+}
+
+void PointMemory::show(const Values &last, const Values &earlier)
+{
+  past_ = earlier.empty() ? Past::last : Past::earlier;
+  for (Room &r : rooms_) {
+    std::copy_n(last.data() + r.begin_, r.last_.size(), r.last_.data());
+    if (!earlier.empty()) r.earlier_.assign(earlier.data() + r.begin_, earlier.data() + r.begin_ + r.last_.size());
+  }
+}
+
+PetscErrorCode PointMemory::evaluate(PetscReal t, Vec x, Vec rate, bool start, Values &values) const
+{
+  PetscFunctionBeginUser;
+  values.resize(size());
+  if (start) {
+    for (const Room &r : rooms_) PetscCall(evaluate_start(r, values.data() + r.begin_));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+  const ReadArray now(x), rates(rate);
+  for (const Room &r : rooms_)
+    PetscCall(evaluate(t, now.data(), rates.data(), model_->step(), false, r, values.data() + r.begin_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -57,6 +94,7 @@ PetscErrorCode PointMemory::add_room(const std::string &surface)
   const std::size_t n = r.places_.size() * static_cast<std::size_t>(r.points_ * r.width_);
   r.last_.assign(n, 0);
   r.next_.assign(n, 0);
+  r.begin_ = size();
   rooms_.push_back(std::move(r));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -98,7 +136,7 @@ Memory PointMemory::Room::accepted(PetscInt i, PetscInt q) const
 }
 
 /// Fills what is given at the start.
-PetscErrorCode PointMemory::take_given(Room &r) const
+PetscErrorCode PointMemory::take_given(const Room &r, PetscScalar *values) const
 {
   PetscFunctionBeginUser;
   for (const MemorySpec *spec : r.specs_) {
@@ -108,16 +146,15 @@ PetscErrorCode PointMemory::take_given(Room &r) const
                spec->effect.c_str());
     for (std::size_t i = 0; i < points; ++i)
       std::copy_n(spec->start->data() + i * n, n,
-                  r.last_.data() + i * static_cast<std::size_t>(r.width_) + static_cast<std::size_t>(spec->offset));
+                  values + i * static_cast<std::size_t>(r.width_) + static_cast<std::size_t>(spec->offset));
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
 PetscErrorCode PointMemory::evaluate(PetscReal t, const PetscScalar *x, const PetscScalar *rate, const Step &step,
-                                     bool start, Room &r, std::vector<PetscScalar> &values) const
+                                     bool start, const Room &r, PetscScalar *value) const
 {
   std::vector<PointSample> now, rates;
-  PetscScalar *value = values.data();
 
   PetscFunctionBeginUser;
   for (std::size_t i = 0; i < r.places_.size(); ++i) {
@@ -127,7 +164,8 @@ PetscErrorCode PointMemory::evaluate(PetscReal t, const PetscScalar *x, const Pe
     if (!start) sampling_.sample(e, rate, rates);
     for (PetscInt q = 0; q < r.points_; ++q, value += r.width_) {
       if (!start) Sampling::take_rates(rates[q], now[q]);
-      Point point = sampling_.point(now[q], e, t, step, r.at(static_cast<PetscInt>(i), q));
+      const Memory before = start ? Memory{value, nullptr} : r.at(static_cast<PetscInt>(i), q);
+      Point point = sampling_.point(now[q], e, t, step, before);
       point.start = start;
       for (const MemorySpec *spec : r.specs_)
         if (!start || !given(*spec)) spec->value(point, constants, value + spec->offset);
@@ -142,7 +180,7 @@ PetscErrorCode PointMemory::compute(PetscReal t, Vec x, Vec rate)
   const ReadArray values(x), rates(rate);
   for (Room &r : rooms_) {
     r.next_.resize(r.last_.size());
-    PetscCall(evaluate(t, values.data(), rates.data(), model_->step(), false, r, r.next_));
+    PetscCall(evaluate(t, values.data(), rates.data(), model_->step(), false, r, r.next_.data()));
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }

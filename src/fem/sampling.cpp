@@ -184,6 +184,32 @@ void Sampling::sample(const Element &e, const PetscScalar *x, std::vector<PointS
   }
 }
 
+void Sampling::add_derivatives(const Element &e, const std::vector<SampleDerivative> &derivatives, PetscScalar *y) const
+{
+  using D = SampleDerivative;
+  const Table &t = tables_[e.table];
+  const element::ScalarBasis of_u = t.u.basis(), of_p = t.p.basis();
+  const PetscInt *dofs = assembly_->cell_dofs(e.cell);
+  // one component: by its value and by its gradient in the mesh, at point q
+  const auto add = [&](const element::ScalarBasis &basis, std::size_t q, PetscScalar by_value,
+                       const PetscScalar by_gradient[3], const PetscInt *at, PetscInt step) {
+    const auto n = static_cast<std::size_t>(basis.stride);
+    const PetscScalar *B = basis.values + q * n, *G = basis.derivatives + 3 * q * n;
+    PetscScalar by[3]; // in the reference cell
+    for (int i = 0; i < 3; ++i)
+      by[i] = e.inverse[3 * i] * by_gradient[0] + e.inverse[3 * i + 1] * by_gradient[1] +
+              e.inverse[3 * i + 2] * by_gradient[2];
+    for (PetscInt a = 0; a < basis.nodes; ++a)
+      y[at[step * a]] += B[a] * by_value + G[a] * by[0] + G[n + a] * by[1] + G[2 * n + a] * by[2];
+  };
+
+  for (std::size_t q = 0; q < derivatives.size(); ++q) {
+    const D &d = derivatives[q];
+    for (int i = 0; i < 3; ++i) add(of_u, q, d[D::u + i], &d[3 * i], dofs + i, 3);
+    if (gas_) add(of_p, q, d[D::p], &d[D::grad_p], dofs + 3 * of_u.nodes, 1);
+  }
+}
+
 void Sampling::coordinates(const Element &e, std::vector<PetscReal> &x) const
 {
   const Table &t = tables_[e.table];

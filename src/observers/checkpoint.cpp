@@ -22,15 +22,15 @@ namespace fs = std::filesystem;
 
 /// Options under these prefixes may change at a restart: the mesh and the programme are compared themselves, the rest
 /// does not change what is computed, but how.
-constexpr std::array<const char *, 13> free_prefixes{
-    "-mesh",    "-ventilator", "-predictor", "-newton",         "-step",  "-output",       "-progress",
-    "-effects", "-checkpoint", "-restart",   "-error_estimate", "-scene", "-sensitivities"};
+constexpr std::array<const char *, 14> free_prefixes{
+    "-mesh",    "-ventilator", "-predictor", "-newton",         "-step",  "-output",        "-progress",
+    "-effects", "-checkpoint", "-restart",   "-error_estimate", "-scene", "-sensitivities", "-sweep"};
 /// Prefixes of options that change no number but rounding, and of what is compared by itself.
-constexpr std::array<const char *, 20> aside{
-    "-mesh",    "-ventilator",   "-output",  "-progress",     "-effects",           "-checkpoint",
-    "-restart", "-ts_max_time",  "-options", "-dm_plex",      "-petscpartitioner",  "-log",
-    "-malloc",  "-info",         "-help",    "-skip_petscrc", "-no_signal_handler", "-error_estimate",
-    "-scene",   "-sensitivities"};
+constexpr std::array<const char *, 21> aside{
+    "-mesh",    "-ventilator",    "-output",  "-progress",     "-effects",           "-checkpoint",
+    "-restart", "-ts_max_time",   "-options", "-dm_plex",      "-petscpartitioner",  "-log",
+    "-malloc",  "-info",          "-help",    "-skip_petscrc", "-no_signal_handler", "-error_estimate",
+    "-scene",   "-sensitivities", "-sweep"};
 constexpr const char *flow_split = "-ventilator_flow_split"; // no part of the programme
 
 template <class List>

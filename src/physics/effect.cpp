@@ -50,7 +50,8 @@ void Composition::remember(std::vector<Quantity> quantities, Callback<MemoryFunc
       offset = std::max(offset, m.offset + static_cast<PetscInt>(m.quantities.size()));
   for (const MemorySpec &m : memories_) // kernels know one place for all surfaces
     if (!m.surface.empty() && !surface.empty() && same_owner(m.owner, value.owners[0])) offset = m.offset;
-  memories_.push_back({effect_, surface, value.owners[0], std::move(quantities), value.function, nullptr, offset});
+  memories_.push_back({effect_, surface, value.owners[0], std::move(quantities), value.function, nullptr, offset, false,
+                       nullptr, nullptr});
   note_readers(effect_, "memory", surface, value.owners);
 }
 
@@ -129,6 +130,12 @@ bool Composition::read_on_surfaces_alone(const char *owner) const
   return std::none_of(readers_.begin(), readers_.end(), [owner](const Reader &reader) {
     return reader.surface.empty() && constants::tag(reader.owner) == constants::tag(owner);
   });
+}
+
+bool Composition::remembers(const char *owner) const
+{
+  return std::any_of(memories_.begin(), memories_.end(),
+                     [owner](const MemorySpec &m) { return !m.told && same_owner(m.owner, owner); });
 }
 
 std::vector<PetscScalar> Composition::constants(const Step &step) const

@@ -7,8 +7,9 @@ namespace pulmo {
 namespace {
 
 /// Options of what a run leaves behind: the other run writes nothing.
-constexpr const char *output_prefixes[] = {"-output",  "-progress",       "-effects", "-energy",  "-checkpoint",
-                                           "-restart", "-error_estimate", "-scene",   "-dry_run", "-sensitivities"};
+constexpr const char *output_prefixes[] = {"-output",     "-progress",      "-effects",        "-energy",
+                                           "-checkpoint", "-restart",       "-error_estimate", "-scene",
+                                           "-dry_run",    "-sensitivities", "-sweep"};
 
 bool is_output_option(const std::string &name)
 {

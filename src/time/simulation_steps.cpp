@@ -173,11 +173,11 @@ PetscErrorCode Simulation::accept_stage(PetscReal t, Vec X, PetscBool *accept)
     PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED)); // a shorter step would be solved no better
     PetscFunctionReturn(PETSC_SUCCESS);
   }
-  if (model_.memory() && scheme_.half_step()) {
-    PetscCall(model_.memory()->compute(t, local_, rate_));
-    model_.memory()->keep_middle();
+  if (scheme_.half_step()) {
+    if (model_.memory()) PetscCall(model_.memory()->compute(t, local_, rate_));
+    PetscCall(record_stage(t, -1, local_));
+    if (model_.memory()) model_.memory()->keep_middle();
   }
-  if (scheme_.half_step()) PetscCall(record_stage(t, -1, local_));
   PetscCall(scheme_.accept_stage(model_, moment(t, measures.volume_change, local_)));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -374,6 +374,7 @@ PetscErrorCode Simulation::after_step()
   if (scene_.facts().airflow) PetscCall(consistent_flow(flow));
   row.flow = flow / units::mm3_per_ml;
   PetscCall(VecCopy(local_, before_));
+  if (model_.memory()) PetscCall(model_.memory()->compute(t, local_, rate_));
   PetscCall(record_stage(t, static_cast<PetscInt>(rows_.size()), local_));
   const PetscReal opening_flow = airway_.opening_flow(row.flow * units::mm3_per_ml);
   const Attempt accepted{t, row.dt, measures.volume_change, pressure, opening_flow, local_};
@@ -398,10 +399,7 @@ PetscErrorCode Simulation::after_step()
   newton_ = krylov_ = 0;
   const PetscReal lost = scheme_.flow(measures.volume_change) - row.flow * units::mm3_per_ml;
   delivered_ += (row.volume - accepted_.volume) * units::mm3_per_ml - lost / scheme_.slope();
-  if (model_.memory()) {
-    PetscCall(model_.memory()->compute(t, local_, rate_));
-    model_.memory()->accept();
-  }
+  if (model_.memory()) model_.memory()->accept();
   PetscCall(scheme_.accept(model_, moment(t, measures.volume_change, local_)));
   step_control_.accept({t, row.volume, row.pressure});
   balance_.accept();
@@ -430,7 +428,9 @@ PetscErrorCode Simulation::record_stage(PetscReal t, PetscInt row, Vec local)
   record.row = row;
   record.phase = phase_ ? static_cast<PetscInt>(phase_ - phases_.data()) : 0;
   record.airway = airway_.condition();
-  PetscCall(trajectory_->keep(record, scheme_, local));
+  PointMemory::Values remembered;
+  if (model_.composition().memory_acts()) model_.memory()->copy(trajectory_->stages().empty(), remembered);
+  PetscCall(trajectory_->keep(record, scheme_, local, remembered));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -11,7 +11,8 @@ Trajectory::~Trajectory()
   if (file_) (void)std::fclose(file_);
 }
 
-PetscErrorCode Trajectory::keep(StageRecord record, const TimeScheme &scheme, Vec local)
+PetscErrorCode Trajectory::keep(StageRecord record, const TimeScheme &scheme, Vec local,
+                                const PointMemory::Values &remembered)
 {
   const auto number = static_cast<PetscInt>(stages_.size());
 
@@ -34,12 +35,16 @@ PetscErrorCode Trajectory::keep(StageRecord record, const TimeScheme &scheme, Ve
   const ReadArray x(local);
   PetscInt n;
   PetscCall(VecGetLocalSize(local, &n));
-  const std::size_t bytes = static_cast<std::size_t>(n) * sizeof(PetscScalar);
+  state_ = static_cast<std::size_t>(n);
+  remembered_ = remembered.size();
+  std::vector<PetscScalar> values(x.data(), x.data() + n);
+  values.insert(values.end(), remembered.begin(), remembered.end());
+  const std::size_t bytes = values.size() * sizeof(PetscScalar);
   place_.push_back(0);
   kept_.emplace_back();
   if (used_ + bytes <= memory_) {
     used_ += bytes;
-    kept_.back().assign(x.data(), x.data() + n);
+    kept_.back() = std::move(values);
     PetscFunctionReturn(PETSC_SUCCESS);
   }
   if (!file_) {
@@ -51,7 +56,7 @@ PetscErrorCode Trajectory::keep(StageRecord record, const TimeScheme &scheme, Ve
     }
   }
   const bool written = file_ && std::fseek(file_, 0, SEEK_END) == 0 && (place_.back() = std::ftell(file_)) >= 0 &&
-                       std::fwrite(x.data(), 1, bytes, file_) == bytes && std::fflush(file_) == 0;
+                       std::fwrite(values.data(), 1, bytes, file_) == bytes && std::fflush(file_) == 0;
   if (!written)
     complaint_ = "the states of the run did not fit into " + folder_ + " (" + std::strerror(errno) +
                  "); give -sweep_memory more, or make room there";
@@ -60,21 +65,34 @@ PetscErrorCode Trajectory::keep(StageRecord record, const TimeScheme &scheme, Ve
 
 PetscErrorCode Trajectory::state(PetscInt stage, Vec local) const
 {
+  PetscFunctionBeginUser;
+  WriteArray x(local);
+  PetscCall(read(stage, 0, state_, x.data()));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Trajectory::remembered(PetscInt stage, PointMemory::Values &values) const
+{
+  PetscFunctionBeginUser;
+  values.resize(remembered_);
+  PetscCall(read(stage, state_, remembered_, values.data()));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Trajectory::read(PetscInt stage, std::size_t begin, std::size_t count, PetscScalar *values) const
+{
   const std::vector<PetscScalar> &kept = kept_[static_cast<std::size_t>(stage)];
-  PetscInt n;
 
   PetscFunctionBeginUser;
-  PetscCall(VecGetLocalSize(local, &n));
-  WriteArray x(local);
+  if (count == 0) PetscFunctionReturn(PETSC_SUCCESS); // a rank without cells
   if (!kept.empty()) {
-    std::copy(kept.begin(), kept.end(), x.data());
+    std::copy_n(kept.data() + begin, count, values);
     PetscFunctionReturn(PETSC_SUCCESS);
   }
-  const std::size_t bytes = static_cast<std::size_t>(n) * sizeof(PetscScalar);
-  if (bytes == 0) PetscFunctionReturn(PETSC_SUCCESS); // a rank without cells
-  const bool read = std::fseek(file_, place_[static_cast<std::size_t>(stage)], SEEK_SET) == 0 &&
-                    std::fread(x.data(), 1, bytes, file_) == bytes;
-  PetscCheck(read, PETSC_COMM_SELF, PETSC_ERR_FILE_READ, "the states of the run could not be read again: %s",
+  const auto place = place_[static_cast<std::size_t>(stage)] + static_cast<std::int64_t>(begin * sizeof(PetscScalar));
+  const bool good =
+      std::fseek(file_, place, SEEK_SET) == 0 && std::fread(values, sizeof(PetscScalar), count, file_) == count;
+  PetscCheck(good, PETSC_COMM_SELF, PETSC_ERR_FILE_READ, "the states of the run could not be read again: %s",
              std::strerror(errno));
   PetscFunctionReturn(PETSC_SUCCESS);
 }

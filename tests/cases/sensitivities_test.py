@@ -61,6 +61,21 @@ class Sensitivities(unittest.TestCase):
                              SCENE[len(pc.BLOCK + pc.QUIET + pc.PAPER + pc.DIRECT):] + ASK)
         self.same(run, krylov, 1e-6)
 
+    def test_effects_that_remember(self):
+        """Two that remember at once, under BDF2: held against runs with another gain, on 2 and 3 ranks, and with all states in a file."""
+        scene = SCENE + ["-ts_type", "bdf", "-viscoelastic", "-recruitment", "-recruitment_opening_pressure", "1",
+                         "-recruitment_closing_pressure", "0.5", "-recruitment_start", "0.3", "-recruitment_gain", "0.2"]
+        run = pc.finished(scene + ASK)
+        one = table(run)
+        moved = [pc.finished(scene + ["-recruitment_gain", repr(0.2 * (1 + s))]).json() for s in (-1e-4, 1e-4)]
+        for key in ("compliance_ml_per_cmH2O", "resistance_cmH2O_s_per_l", "peak_inspiratory_pressure_cmH2O"):
+            self.assertAlmostEqual((moved[1][key] - moved[0][key]) / (2e-4 * 0.2), one[key]["-recruitment_gain"],
+                                   delta=1e-4 * abs(one[key]["-recruitment_gain"]), msg=key)
+        for ranks in (2, 3):
+            with self.subTest(ranks=ranks):
+                self.same(run, pc.finished(scene + ASK, ranks=ranks), 1e-6)
+        self.same(run, pc.finished(scene + ASK + ["-sweep_memory", "0"]), 1e-12)
+
     def test_a_solver_that_does_not_solve(self):
         """Twelve iterations are enough for Newton's method, and not for a sweep to twelve digits: told, and no derivative is given."""
         short = pc.finished(SCENE[:len(pc.BLOCK + pc.QUIET + pc.PAPER)] + pc.options_file("solvers/iterative.opts") +
@@ -189,7 +204,7 @@ class Sensitivities(unittest.TestCase):
 
     def test_refused(self):
         for options, words in ((["-sensitivities", "C_rs,compliance"], "knows no number 'compliance'"),
-                               (["-sensitivities", "C_rs", "-viscoelastic"], "-viscoelastic"),
+                               (["-sensitivities", "C_rs", "-prestress", "-prestress_method", "inverse"], "what -prestress solves for before the run"),
                                (["-sensitivities", "C_rs", "-airway_tree", "star"], "-airway_tree"),
                                (["-sensitivities", "C_rs", "-petscfe_type", "basic"], "-petscfe_type"),
                                (["-sweep_rtol", "1e-3"], "-sensitivities"),

@@ -1,5 +1,6 @@
 // The laws and effects of docs/extending.md, as readers copy them from the page.
 #include "registered.hpp"
+#include "unit/harness.hpp"
 #include "unit/scenes.hpp"
 
 #include "pulmo/observers/energy.hpp"
@@ -65,6 +66,19 @@ TEST(Extending, LawsAreThoseOfTheirEnergy)
   Tensor rest;
   laws[0]->stress(state_of_F(identity), rest.data());
   EXPECT_LT(largest(rest), 1e-15);
+}
+
+/// One of them remembers on surfaces.
+TEST(Extending, TheSweepGoesThroughEffects)
+{
+  const Registry registry = registry_of_the_page();
+  for (const auto &effect : added(registry.make_effects(), Registry::standard().make_effects())) {
+    Findings refused;
+    for (const Subject &subject : alone(registry, {effect->name()}, refused)) {
+      SCOPED_TRACE(subject.text());
+      for (const std::string &finding : find({"adjoint", check_adjoint, false}, subject)) ADD_FAILURE() << finding;
+    }
+  }
 }
 
 TEST(Extending, JacobiansAreThoseOfTheResiduals)

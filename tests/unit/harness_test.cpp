@@ -69,12 +69,22 @@ TEST_P(Harness, FindsNothing)
 INSTANTIATE_TEST_SUITE_P(Registered, Harness, testing::ValuesIn(checks()),
                          [](const auto &check) { return std::string(check.param.name); });
 
-TEST(HarnessAdjoint, TheSweepIsTheDerivativeWithEachEffect)
+void check_sweeps(const std::vector<Subject> &subjects)
 {
-  for (const Subject &subject : scenes().alone) {
+  for (const Subject &subject : subjects) {
     SCOPED_TRACE(subject.text());
     for (const std::string &finding : find({"adjoint", check_adjoint, false}, subject)) ADD_FAILURE() << finding;
   }
+}
+
+TEST(HarnessAdjoint, TheSweepIsTheDerivativeWithEachEffect)
+{
+  check_sweeps(scenes().alone);
+}
+
+TEST(HarnessAdjoint, TheSweepIsTheDerivativeWhereEffectsMeet)
+{
+  check_sweeps(scenes().together);
 }
 
 TEST(HarnessScenes, EachEffectIsTakenAndEachRefusalIsASentence)

@@ -43,6 +43,7 @@ class Outcome:
     choice: Choice
     run: dict
     parts: dict  # number -> what the sweep says of it
+    mesh: str
 
     @property
     def cells(self):
@@ -66,10 +67,9 @@ class Goal:
 
     # ------------------------------------------------------------ runs
 
-    def words(self, choice):
+    def words(self, choice, mesh):
         o = self.options
         start = [] if o.ranks == 1 else [*o.launcher.split(), str(o.ranks)]
-        mesh = self.mesh(choice)
         return [*start, o.build / "pulmo", *self.scene, "-options_file", str(self.solver()), *o.flags, *self.chosen(choice, mesh),
                 "-error_estimate_method", "sweep"]
 
@@ -103,8 +103,9 @@ class Goal:
         """Runs a choice; True if it is done."""
         print(f"[{len(self.outcomes) + 1}] {choice.name}: " + (f"about {self.predict(choice):.0f} s, " if self.outcomes else "")
               + f"{max(0, self.options.budget - self.spent):.0f} of {self.options.budget:.0f} s left", flush=True)
+        mesh = self.mesh(choice)
         longest = max(1.0, self.options.budget - self.spent) * (1 if self.options.clock == "wall" else 4)
-        run = runs.measured([*self.words(choice), "-output_dir"], self.options.results / "runs", 0, self.options.ranks, longest)
+        run = runs.measured([*self.words(choice, mesh), "-output_dir"], self.options.results / "runs", 0, self.options.ranks, longest)
         self.spent += run[self.options.clock]
         if run["code"]:
             self.refused = run["reason"]
@@ -113,7 +114,7 @@ class Goal:
         estimate = run["summary"].get("error_estimate") or {}
         if lacking := [short(key) for key in self.asked if key not in estimate.get("numbers", {})]:
             fail(f"the scene has no {', '.join(lacking)}" + (f": {estimate['failure']}" if "failure" in estimate else ""))
-        self.outcomes.append(Outcome(choice, run, estimate["numbers"]))
+        self.outcomes.append(Outcome(choice, run, estimate["numbers"], mesh))
         for key in self.asked:
             print(f"    {self.value(key)}", flush=True)
         return True
@@ -274,7 +275,7 @@ class Goal:
             page.write_setting(folder / file_name(share), self.asked, [
                 f"corrected value and bar of a run with its sweep, found by\n#   {command}", self.last.choice.name,
                 f"{self.last.run['cpu']:.3g} s CPU, {self.last.run['wall']:.3g} s wall, {self.last.run['memory']:.0f} MB on {processor()}"],
-                self.solver(), self.options.flags, self.chosen(self.last.choice, self.mesh(self.last.choice)))
+                self.solver(), self.options.flags, self.chosen(self.last.choice, self.last.mesh))
         print(f"wrote {folder / 'README.md'}\n")
         return sentences
 

@@ -4,6 +4,7 @@
 #pragma once
 
 #include "pulmo/adjoint/functional.hpp"
+#include "pulmo/adjoint/memory_sweep.hpp"
 #include "pulmo/time/simulation.hpp"
 
 #include <functional>
@@ -20,7 +21,7 @@ namespace pulmo {
 /// The matrix is the transposed Jacobian of the stage, in the run's own matrix and by its own solver. Where the
 /// pressure at the opening is an unknown its equation c(P, V) = 0 has a multiplier of its own, eliminated as in
 /// ScalarUnknowns. The consistent flux into a held airway is a sum of rows of R_n: its derivative stands in z_n at
-/// these nodes.
+/// these nodes. What effects remember has multipliers of its own (MemorySweep).
 class Sweep {
 public:
   Sweep(const Scene &scene, Model &model, Simulation &simulation, const Trajectory &trajectory)
@@ -41,6 +42,7 @@ public:
     /// multiplier of the opening's equation in place, which stands in @p opening.
     std::vector<PetscReal> by_volume, by_mean_pressure, opening;
     std::vector<PetscReal> by_flow; ///< [functional]: of the gas of this stage through the opening, s/mm^3
+    std::vector<const MemorySweep::Values *> by_memory; ///< [functional]: l; null: none
   };
   using Visit = std::function<PetscErrorCode(const Solved &)>;
 
@@ -54,6 +56,13 @@ public:
   void ask_targets() { targets_ = true; }
   /// Whether rates act in the kernels by more than the gas that is stored; known once a stage was solved.
   bool other_rates() const { return other_rates_.value_or(false); }
+  /// The residual of @p stage, or the share of the facets in it, times the multipliers, cell by cell:
+  /// [functional][cell], with the parameters as they are now. Of what is remembered, too.
+  PetscErrorCode weighted_residual(const Solved &stage, bool facets, std::vector<std::vector<PetscReal>> &sums);
+  /// After the sweep: whether a number follows from what is remembered at the start.
+  bool wants_start() const { return memory_ && !start_.empty(); }
+  /// What is remembered there at the start times its multipliers, in the same way.
+  PetscErrorCode weighted_start(bool facets, std::vector<std::vector<PetscReal>> &sums);
 
   /// Lets @p request end the sweep after the stage at hand; stopped() tells that it did. It must outlive the sweep.
   void heed(StopRequest &request) { stop_request_ = &request; }
@@ -67,7 +76,9 @@ private:
   struct Wanted {
     VecHandle state;                              ///< local, to be summed over the ranks; null: nothing
     PetscReal volume = 0, pressure = 0, flow = 0; ///< per mm^3, kPa (at the opening), mm^3/s
-    bool nothing() const { return !state && volume == 0 && pressure == 0 && flow == 0; }
+    MemorySweep::Values memory;                   ///< by what is remembered; empty: nothing
+    bool nothing() const { return !state && volume == 0 && pressure == 0 && flow == 0 && memory.empty(); }
+    const MemorySweep::Values *weights() const { return memory.empty() ? nullptr : &memory; }
   };
   using Pending = std::map<PetscInt, std::vector<Wanted>>;
 
@@ -101,6 +112,10 @@ private:
   PetscErrorCode dot(Vec a, Vec b, PetscReal &sum) const;
   /// Adds (dR/dx_i)^T z for the stages that @p record looks back at.
   PetscErrorCode look_back(const StageRecord &record, Vec z, std::size_t functional, Pending &pending);
+  /// Adds what is remembered of a stage to what is wanted of its state and of those that it looks back at.
+  PetscErrorCode want_by_memory(const StageRecord &record, std::vector<Wanted> &want, Pending &pending);
+  /// Adds what a stage, solved, wants of what is remembered of those that it looks back at.
+  PetscErrorCode look_back_at_memory(const Solved &stage, Pending &pending);
   /// Whether rates act in the kernels by more than the gas that is stored.
   PetscErrorCode compare_rates(const StageRecord &record);
 
@@ -108,10 +123,12 @@ private:
   Model &model_;
   Simulation &simulation_;
   const Trajectory &trajectory_;
-  std::size_t count_ = 0; ///< of the numbers
-  KSP ksp_ = nullptr;     ///< of the run
-  bool gas_ = false;      ///< there is a mass balance
-  bool targets_ = false;
+  std::unique_ptr<MemorySweep> memory_; ///< null: nothing follows from what is remembered
+  std::vector<Wanted> start_;           ///< of the start, once all is swept
+  std::size_t count_ = 0;               ///< of the numbers
+  KSP ksp_ = nullptr;                   ///< of the run
+  bool gas_ = false;                    ///< there is a mass balance
+  bool targets_ = false;                ///< are asked for
   std::optional<bool> other_rates_;
   struct {
     PetscInt age = 0;

@@ -36,6 +36,15 @@ public:
     Memory at(PetscInt i, PetscInt q) const;
     /// The last accepted state as its observers see it.
     Memory accepted(PetscInt i, PetscInt q) const;
+    /// The surface; empty: the cells.
+    const std::string &surface() const { return surface_; }
+    /// Quadrature points of a place.
+    PetscInt points() const { return points_; }
+    const std::vector<Sampling::Element> &places() const { return places_; }
+    /// What is remembered there.
+    const std::vector<const MemorySpec *> &specs() const { return specs_; }
+    /// Where this room begins in Values.
+    std::size_t begin() const { return begin_; }
     /// The mesh points of the facets.
     const std::vector<PetscInt> &facets() const { return facets_; }
     /// The quadrature points of place @p i, [point][3], mm.
@@ -49,10 +58,24 @@ public:
     std::vector<Sampling::Element> places_;
     std::vector<PetscInt> facets_;
     PetscInt width_ = 0, points_ = 0;
+    std::size_t begin_ = 0;
     std::vector<PetscScalar> last_, earlier_, middle_, next_;
   };
   /// That of the cells, or of the facets of @p surface; null if nothing is remembered there.
   const Room *room(const std::string &surface = "") const;
+  const std::vector<Room> &rooms() const { return rooms_; }
+  const Sampling &sampling() const { return sampling_; }
+
+  /// What is remembered in all rooms, one after the other.
+  using Values = std::vector<PetscScalar>;
+  std::size_t size() const { return rooms_.empty() ? 0 : rooms_.back().begin_ + rooms_.back().last_.size(); }
+  /// What was computed last, or what there is at the start.
+  void copy(bool start, Values &values) const;
+  /// Lets kernels see @p last, and of the state before that @p earlier, or none if that is empty.
+  void show(const Values &last, const Values &earlier);
+  /// What follows from the local vectors @p x and @p rate at time @p t and from what kernels see, in @p values; or, if
+  /// @p start, what there is at the start.
+  PetscErrorCode evaluate(PetscReal t, Vec x, Vec rate, bool start, Values &values) const;
 
   /// Computes all quantities at time @p t from the local vectors @p x and @p rate, with the constants of the step at
   /// hand.
@@ -76,10 +99,11 @@ public:
 private:
   PetscErrorCode add_room(const std::string &surface);
   static bool given(const MemorySpec &spec) { return spec.start && !spec.start->empty(); }
-  PetscErrorCode take_given(Room &room) const;
+  PetscErrorCode take_given(const Room &room, PetscScalar *values) const;
   /// Calls the effects' own functions at all points.
   PetscErrorCode evaluate(PetscReal t, const PetscScalar *x, const PetscScalar *rate, const Step &step, bool start,
-                          Room &room, std::vector<PetscScalar> &values) const;
+                          const Room &room, PetscScalar *values) const;
+  PetscErrorCode evaluate_start(const Room &room, PetscScalar *values) const;
 
   const Model *model_ = nullptr;
   Sampling sampling_;

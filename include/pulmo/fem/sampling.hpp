@@ -4,6 +4,8 @@
 
 #include "pulmo/fem/model.hpp"
 
+#include <array>
+
 namespace pulmo {
 
 /// A state at one point.
@@ -14,6 +16,11 @@ struct PointSample {
   PetscScalar p;                        ///< kPa (airflow only)
   PetscScalar grad_p[3];                ///< kPa/mm (airflow only)
   PetscScalar u_t[3], p_t, grad_p_t[3]; ///< rates, as that in the state: of make_rates(), else 0
+};
+
+/// What a number has as derivatives by what a sample holds: by Grad u, u, p and Grad p.
+struct SampleDerivative : std::array<PetscScalar, 16> {
+  static constexpr std::size_t u = 9, p = 12, grad_p = 13; ///< where these begin; Grad u is first
 };
 
 /// The points of the model's own rules in the integrator's order, so that integrals match the weak form term by term.
@@ -42,6 +49,8 @@ public:
   void coordinates(const Element &element, std::vector<PetscReal> &x) const;
   /// States at the points of @p element for the local vector @p x.
   void sample(const Element &element, const PetscScalar *x, std::vector<PointSample> &samples) const;
+  /// Adds to the local vector @p y what @p derivatives at the points of @p element are by the vector of sample().
+  void add_derivatives(const Element &element, const std::vector<SampleDerivative> &derivatives, PetscScalar *y) const;
   /// Gives @p now the rates that backward Euler finds in it after @p before, @p dt seconds earlier.
   static void make_rates(const PointSample &before, PetscReal dt, PointSample &now);
   /// Gives @p now the rates that the sample @p rate of a vector of rates holds.

@@ -198,7 +198,10 @@ struct MemorySpec {
   MemoryFunction value; ///< what they are in a state
   /// What they are at the start, [cell][point][quantity], where that is not for @p value to say; null: it is.
   std::shared_ptr<const std::vector<PetscScalar>> start;
-  PetscInt offset = 0; ///< among the scalars of a point
+  PetscInt offset = 0;              ///< among the scalars of a point
+  bool told = false;                ///< no kernel reads them: they are for the signals and the fields
+  PastFunction by_past = nullptr;   ///< null: differences tell how all follows from them
+  StateFunction by_state = nullptr; ///< null: differences tell how they follow from the state
 };
 
 /// A parameter of a kernel that follows from others, wherever these differ from place to place.
@@ -283,12 +286,27 @@ public:
   /// Lets an effect remember quantities at the points of the cells, or of the facets of @p surface. @p value computes
   /// all of them from a state, of which the effect sees those before in Point::memory and Point::past(); it is called
   /// once for an accepted step, and at the start (memory.last is null then). Kernels there whose parameters have the
-  /// same owner see what is remembered. An effect that remembers on several surfaces remembers the same on each.
+  /// same owner see what is remembered; residuals and @p value follow from it through Point::past() alone, where there
+  /// are states before. An effect that remembers on several surfaces remembers the same on each.
   void remember(std::vector<Quantity> quantities, Callback<MemoryFunction> value, const std::string &surface = "");
   /// Says what the quantities that were declared last are at the start: [cell][point][quantity], filled before
   /// Model::build().
   void begin_with(std::shared_ptr<const std::vector<PetscScalar>> start) { memories_.back().start = std::move(start); }
+  /// Says that no kernel reads the quantities that were declared last.
+  void only_tell() { memories_.back().told = true; }
+  /// Says how all that the effect does follows from the quantities that were declared last, and these from the state.
+  /// Where they are many that is less work for the backward sweep than differences.
+  void follows(Callback<PastFunction> by_past, Callback<StateFunction> by_state)
+  {
+    memories_.back().by_past = by_past.function;
+    memories_.back().by_state = by_state.function;
+  }
   const std::vector<MemorySpec> &memories() const { return memories_; }
+  /// Whether the residual of a step follows from anything that is remembered.
+  bool memory_acts() const
+  {
+    return std::any_of(memories_.begin(), memories_.end(), [](const MemorySpec &m) { return !m.told; });
+  }
   /// What @p effect remembers in the cells; null: nothing.
   const MemorySpec *remembered_in_cells(const std::string &effect) const
   {
@@ -424,6 +442,8 @@ public:
   std::vector<std::string> surfaces_that_read(const char *owner) const;
   /// Whether no term of the volume reads them.
   bool read_on_surfaces_alone(const char *owner) const;
+  /// Whether a kernel with the parameters of @p owner remembers what acts in later steps.
+  bool remembers(const char *owner) const;
   /// Refuses terms that read parameters which no effect hands over, or two hand over, and memories that cannot be told
   /// apart: errors in an effect's code.
   PetscErrorCode check_parameters(MPI_Comm comm) const;

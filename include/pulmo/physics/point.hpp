@@ -354,6 +354,23 @@ template <class P>
 using MemoryKernel = void (*)(const Point &now, const P &, PetscScalar value[]);
 using MemoryFunction = void (*)(const Point &now, const PetscScalar constants[], PetscScalar value[]);
 
+/// How what an effect says at a point follows from what it remembers there (Composition::by_past): adds to by_past[i]
+/// the derivative of  sum_j weights[j] value[j] + f1 : gradient  by Point::past(i). value: what it remembers next; f1:
+/// of its own terms of the displacement.
+template <class P>
+using PastKernel = void (*)(const Point &now, const P &, const PetscScalar weights[], const PetscScalar gradient[9],
+                            PetscScalar by_past[]);
+using PastFunction = void (*)(const Point &now, const PetscScalar constants[], const PetscScalar weights[],
+                              const PetscScalar gradient[9], PetscScalar by_past[]);
+
+/// How value follows from the state, weighted alike: adds to by_gradient the derivative by Grad u, and to by_pressure
+/// that by the pressure of the gas in the pores. It follows from nothing else of the state.
+template <class P>
+using StateKernel = void (*)(const Point &now, const P &, const PetscScalar weights[], PetscScalar by_gradient[9],
+                             PetscScalar &by_pressure);
+using StateFunction = void (*)(const Point &now, const PetscScalar constants[], const PetscScalar weights[],
+                               PetscScalar by_gradient[9], PetscScalar &by_pressure);
+
 namespace detail {
 
 /// @p point with its memory as the owner of @p P sees it.
@@ -382,6 +399,20 @@ void remembered(const Point &now, const PetscScalar c[], PetscScalar value[])
   K(own_memory<P>(now, c), constants::get<P>(c), value);
 }
 
+template <class P, PastKernel<P> K>
+void by_past(const Point &now, const PetscScalar c[], const PetscScalar weights[], const PetscScalar gradient[9],
+             PetscScalar by[])
+{
+  K(own_memory<P>(now, c), constants::get<P>(c), weights, gradient, by);
+}
+
+template <class P, StateKernel<P> K>
+void by_state(const Point &now, const PetscScalar c[], const PetscScalar weights[], PetscScalar by_gradient[9],
+              PetscScalar &by_pressure)
+{
+  K(own_memory<P>(now, c), constants::get<P>(c), weights, by_gradient, by_pressure);
+}
+
 } // namespace detail
 
 /// Callback of an energy kernel.
@@ -391,5 +422,11 @@ constexpr Callback<EnergyDensity> energy_density{detail::energy_density<P, K>, o
 /// Callback of a memory kernel.
 template <class P, MemoryKernel<P> K>
 constexpr Callback<MemoryFunction> remembered{detail::remembered<P, K>, owners_of<P>()};
+
+/// Callbacks of its derivatives.
+template <class P, PastKernel<P> K>
+constexpr Callback<PastFunction> by_past{detail::by_past<P, K>, owners_of<P>()};
+template <class P, StateKernel<P> K>
+constexpr Callback<StateFunction> by_state{detail::by_state<P, K>, owners_of<P>()};
 
 } // namespace pulmo

@@ -179,6 +179,7 @@ public:
       c.energy(Energy::numerical, "numerical_dissipation", surface, energy_density<P, K::numerical>);
       c.remember({{"cavity_penetration", "mm"}, {"cavity_push", "kPa"}, {"cavity_touch", "1"}, {"cavity_give", "1"}},
                  remembered<P, K::remember>, surface);
+      c.only_tell();
     }
     const std::size_t penetration = c.sum_up(0, Over::largest_of_facets, 1), push = c.sum_up(1, Over::facets, 1),
                       touch = c.sum_up(2, Over::facets, 1);

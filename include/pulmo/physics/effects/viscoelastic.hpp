@@ -105,6 +105,47 @@ struct ViscoelasticKernels {
     for (int i = 0; i < n; ++i)
       for (int m = 0; m < tensor; ++m) value[tensor * (i + 1) + m] = s.h[i][m];
   }
+  static void by_past(const Point &point, const Parameters &k, const PetscScalar weights[],
+                      const PetscScalar gradient[9], PetscScalar by[])
+  {
+    const PetscScalar *F = point.state.F;
+    PetscScalar along[tensor] = {0}; // F sum h : gradient, by h
+    for (int i = 0; i < 3; ++i)
+      for (int J = 0; J < 3; ++J)
+        for (int L = 0; L < 3; ++L) along[place(L, J)] += F[3 * i + L] * gradient[3 * i + J];
+    for (int i = 0; i < static_cast<int>(k.branches); ++i)
+      for (int m = 0; m < tensor; ++m) {
+        const int own = tensor * (i + 1) + m;
+        const PetscScalar by_h = (weights[own] + along[m]) / (point.step.slope + 1 / k.tau[i]);
+        by[m] += k.g[i] * by_h;
+        by[own] -= by_h;
+      }
+  }
+  /// Weights w of S_e are V : dP_e - V : (dF S_e), V = F^-T w.
+  static void by_state(const Point &point, const Parameters &k, const PetscScalar weights[], PetscScalar by_gradient[9],
+                       PetscScalar &by_p)
+  {
+    const State s = overstress(point, k);
+    const PetscScalar a = point.step.slope;
+    PetscScalar V[9] = {0}, A[81] = {0}, P[9] = {0};
+    for (int m = 0; m < tensor; ++m) {
+      PetscScalar w = weights[m];
+      for (int i = 0; i < static_cast<int>(k.branches); ++i)
+        w += k.g[i] * a / (a + 1 / k.tau[i]) * weights[tensor * (i + 1) + m];
+      for (int i = 0; i < 3; ++i) V[3 * i + column[m]] += point.state.cof_F[3 * i + row[m]] / point.state.J * w;
+    }
+    constants::to_pointer<LawFunctions::Tangent>(k.tangent)(point, A);
+    for (int m = 0; m < 3; ++m)
+      for (int L = 0; L < 3; ++L)
+        for (int J = 0; J < 3; ++J) {
+          by_gradient[3 * m + L] -= V[3 * m + J] * s.S_e[place(L, J)];
+          for (int i = 0; i < 3; ++i) by_gradient[3 * m + L] += V[3 * i + J] * A[27 * i + 9 * m + 3 * J + L];
+        }
+    const auto by_pressure = constants::to_pointer<StressByPressure>(k.by_pressure);
+    if (!by_pressure) return;
+    by_pressure(point, point.constants, P);
+    for (int i = 0; i < 9; ++i) by_p += V[i] * P[i];
+  }
   /// Work that the overstress takes up in a step, F sum h : dF, kPa. What a branch stores comes back within a cycle;
   /// the rest is heat.
   static PetscScalar work(const Point &now, const Point &before, const Parameters &k)
@@ -185,12 +226,12 @@ public:
             {(i == 0 ? "elastic_stress_" : "overstress_" + std::to_string(i) + "_") + component, "kPa"});
     c.parameters(parameters_);
     c.remember(quantities, remembered<P, K::remember>);
+    c.follows(by_past<P, K::by_past>, by_state<P, K::by_state>);
     c.residual("F sum h : Grad eta", displacement, f1(volume_residual<P, K::stress>));
     c.jacobian("overstress", displacement, displacement, g3(volume_jacobian<P, K::stress_by_displacement>));
-    if (facts.airflow && facts.stress_by_pressure) {
-      parameters_.by_pressure = constants::to_scalar(facts.stress_by_pressure);
+    parameters_.by_pressure = constants::to_scalar(facts.stress_by_pressure);
+    if (facts.airflow && facts.stress_by_pressure)
       c.jacobian("overstress", displacement, pressure, g2(volume_jacobian<P, K::stress_by_pressure>));
-    }
     c.energy(Energy::dissipated, "viscous_tissue", "", energy_density<P, K::work>);
     PetscFunctionReturn(PETSC_SUCCESS);
   }
