@@ -14,7 +14,7 @@ constexpr double factor_of_safety = 1.25, doubtful_factor = 3;
 constexpr double seen_by_richer = 0.75;
 
 /// Of the bar of a sweep: over its parts, of the corrected value over that, and the largest part that is one.
-constexpr double swept_factor = 1.5, corrected_share = 0.5, largest_part = 0.1;
+constexpr double swept_factor = 1.5, corrected_share = 1. / 3, largest_part = 0.1;
 
 } // namespace
 

@@ -370,6 +370,37 @@ class Tool(unittest.TestCase):
             self.assertEqual(list(csv.DictReader(f)), rows)
         self.assertEqual(re.search(r"\*\*V_T.*", (folder / "README.md").read_text())[0], re.search(r"\*\*V_T.*", text)[0])
 
+    def test_answer_by_sweeps(self):
+        """Each run tells its errors and what to change; the corrected values hold a run that is far finer. A second call runs nothing."""
+        folder = pathlib.Path(pulmo.scratch())
+        call = ["pcv", "--build", os.path.dirname(pulmo.PROGRAM), "--solvers", "direct", "--output", folder, "--budget", "3min", "--clock", "cpu",
+                "--method", "sweep", "--question", "V_T=2%", "--question", "C_rs=2%", "--meshes", pulmo.mesh("cube_coarse.msh"), "--", *SCENE]
+        first = tool(*call)
+        self.assertEqual(first.returncode, 0, first.stdout + first.stderr)
+        fine = pulmo.finished(pulmo.PCV + pulmo.options_file("solvers/iterative.opts") + ["-dm_plex_filename", pulmo.mesh("cube_fine.msh")] +
+                              SCENE + ["-ts_type", "bdf", "-ts_dt", "0.02"]).json()
+        last = first.stdout[first.stdout.index("wrote "):]
+        for name, key, share in (("V_T", "tidal_volume_ml", 0.02), ("C_rs", "compliance_ml_per_cmH2O", 0.02)):
+            value, bar = map(float, re.search(rf"^{name} = ([\d.]+) ± ([\d.]+)", last, re.MULTILINE).groups())
+            print(f"{name} = {value} ± {bar}, finer {fine[key]:.6g}")
+            self.assertLessEqual(bar, share * value)
+            self.assertLessEqual(abs(value - fine[key]), bar + 0.01 * fine[key])  # that has errors of its own
+        self.assertGreater(first.stdout.count("left\n"), 1, "the first run does not meet it")
+        run = pulmo.finished(pulmo.PCV + SCENE + ["-options_file", str(folder / "recommended_2percent.opts")])
+        self.assertEqual(run.json()["error_estimate"]["method"], "sweep")
+        again = tool(*call)
+        self.assertEqual(again.stdout[again.stdout.index("wrote "):].split(";")[0], last.split(";")[0])
+
+    def test_no_answer_by_sweeps(self):
+        call = ["pcv", "--build", os.path.dirname(pulmo.PROGRAM), "--output", pulmo.scratch(), "--method", "sweep", "--meshes",
+                pulmo.mesh("cube_coarse.msh")]
+        for more, said in ((["--question", "V_T=4%", "--", *SCENE, "-viscoelastic"], "-viscoelastic"), (["--", *SCENE], "--question"),
+                           (["--question", "auto_peep_cmH2O=1%", "--", *SCENE], "auto_peep")):
+            run = tool(*call, *more)
+            self.assertNotEqual(run.returncode, 0)
+            self.assertIn(said, run.stderr)
+            self.assertNotIn("Traceback", run.stderr)
+
     def test_recommended_file_goes_after_the_flags(self):
         """It says how the mesh is made and keeps to what the user's flags set of the solver."""
         path = pathlib.Path(pulmo.scratch())

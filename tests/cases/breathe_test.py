@@ -241,15 +241,18 @@ class Ended(unittest.TestCase):
 
 class Within(unittest.TestCase):
     def test_the_run_takes_what_the_search_found(self):
-        """The setting named by tools/accuracy_cost, though a step of the call's own scene is smaller."""
+        """The setting that tools/accuracy_cost found by sweeps, though a step of the call's own scene is smaller; the run has its bars."""
         place = folder()
         made = called(os.path.join(pulmo.SOURCE, "meshes/cube_lung.msh"), "--case", "c", *QUICK, "--within", "C_rs=20%", "--budget", "5min", "--",
                       "-mesh_scale", "10", "-ts_dt", "0.01", cwd=place)
         self.assertEqual(made.returncode, 0, made.stdout + made.stderr)
-        found = re.search(r"backward Euler ([\d.]+) s", re.search(r"\*\*C_rs within 20 %\*\*: (.*)", made.stdout)[1])
-        self.assertGreater(float(found[1]), 0.01)
+        value, bar = map(float, re.findall(r"^ *C_rs = ([\d.]+) ± ([\d.]+)", made.stdout, re.MULTILINE)[-1])
+        self.assertLess(bar, 0.2 * value)
+        found = (place / "c/accuracy/recommended_20percent.opts").read_text()
         summary = json.loads((place / "c/run/summary.json").read_text())
-        self.assertEqual(float(summary["options"]["-ts_dt"]), float(found[1]))
+        self.assertEqual(float(summary["options"]["-ts_dt"]), float(re.search(r"^-ts_dt (.*)$", found, re.MULTILINE)[1]))
+        self.assertGreater(float(summary["options"]["-ts_dt"]), 0.01)
+        self.assertAlmostEqual(summary["error_estimate"]["numbers"]["compliance_ml_per_cmH2O"]["corrected"], value, delta=1e-3 * value)
 
 
 class Mistakes(unittest.TestCase):

@@ -80,7 +80,7 @@ TEST(LackingBar, CountsPartsThatMayCancelApart)
   EXPECT_NEAR(*bar.space, 1.2 * 1.5 * 9 / 0.75, 1e-12);
   EXPECT_NEAR(*bar.solver, 0.5, 1e-12);
   EXPECT_NEAR(*bar.corrected, 500 + 2 - 3 / 0.75 - 0.5, 1e-12);
-  EXPECT_NEAR(*bar.corrected_error, *bar.total() / 2, 1e-12);
+  EXPECT_NEAR(*bar.corrected_error, *bar.total() / 3, 1e-12);
   EXPECT_TRUE(bar.unresolved.empty());
 }
 

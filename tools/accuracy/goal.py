@@ -1,4 +1,6 @@
 """Answers a question by sweeps: each run tells its error in time and in space, and what is cheapest to change comes next."""
+import argparse
+import copy
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,6 +13,7 @@ from . import page, settings
 from .numbers import SHORT, file_name, percent, short
 
 FIRST_SIZE = 30                 # mm, of the built-in lungs
+FIRST_STEP = 0.05               # s
 FINER = (0.9, 0.75, 0.6, 0.5)   # what sizes of cells and steps may be changed by at once
 ORDER_IN_SPACE = 1.5            # of a number in the size of the cells, until two meshes tell
 ORDERS_BELIEVED = (1.0, 3.0)    # what two meshes may tell
@@ -18,6 +21,8 @@ ROWS, BDF2 = 1.0, 0.3           # order of the sums over rows; share of the step
 COST_OF_BDF2 = 1.3              # of a step
 GROWTH = 1.1                    # exponent of the cost of a step over cells
 MARGIN = 0.8                    # a prediction aims at so much of what is allowed
+TELLING = 0.76                  # sizes of cells that tell of their facets: of two nearer ones the difference is doubtful
+STAKE = 0.6                     # of what the budget leaves, for a run that does not promise the answer
 MOST_RUNS = 12
 
 
@@ -136,9 +141,9 @@ class Goal:
         return abs(now.corrected(key) - before.corrected(key)) * ratio / (1 - ratio)
 
     def bar(self, key):
-        """Of the corrected value; infinite where a part is not resolved."""
+        """Of the corrected value, with the facets; infinite where a part is not resolved."""
         error = self.last.parts[key]["corrected_error"]
-        return math.inf if error is None else error + self.geometry(key)
+        return math.inf if error is None else math.hypot(error, self.geometry(key))
 
     def share(self, key):
         return self.bar(key) / abs(self.last.corrected(key))
@@ -173,7 +178,7 @@ class Goal:
         steps = abs(lacks["steps"]) * shorter ** order * (1 if choice.scheme == now.scheme else BDF2)
         space = (abs(lacks["flow_in_space"]) + abs(lacks["tissue_in_space"])) / SEEN * finer ** self.order_in_space(key)
         value, geometry = self.last.corrected(key), self.geometry(key)
-        if math.isinf(geometry) and finer > 0.9:
+        if math.isinf(geometry) and finer > TELLING:
             return math.inf
         geometry = 0 if math.isinf(geometry) else geometry * finer ** 2
         if part["not_resolved"] and "for its phases" in part["not_resolved"] and shorter > 0.5:
@@ -181,7 +186,8 @@ class Goal:
         share = max((steps + abs(lacks["rows"]) * shorter ** ROWS) / abs(value), space / abs(value))
         if share > LARGEST:
             return math.inf
-        return geometry / abs(value) + FACTOR * (steps + abs(lacks["rows"]) * shorter ** ROWS + (1 + space / abs(value)) * space) / abs(value) + abs(lacks["solver"] / value)
+        error = FACTOR * (steps + abs(lacks["rows"]) * shorter ** ROWS + (1 + space / abs(value)) * space) + abs(lacks["solver"])
+        return math.hypot(error, geometry) / abs(value)
 
     def predict(self, choice):
         """Seconds of a choice with its sweep, by the last run."""
@@ -193,7 +199,7 @@ class Goal:
         return now.run[self.options.clock] * work * scheme
 
     def next(self):
-        """The cheapest choice that promises what is asked, or the one that comes nearest to it."""
+        """The cheapest choice that promises what is asked, or else the one that comes nearest to it; None: the budget has none."""
         now = self.last.choice
         field = ""
         if not now.mesh and self.options.adapt:
@@ -212,13 +218,17 @@ class Goal:
                     choice = replace(there, dt=now.dt * shorter, scheme=scheme)
                     if choice != now:
                         found.append(choice)
+        left = self.options.budget - self.spent
+        found = [c for c in found if self.predict(c) <= left]
         worst = {c: max(self.promised(key, c) / (MARGIN * share) for key, share in self.asked.items()) for c in found}
-        met = [c for c in found if worst[c] <= 1]
-        if met:
+        if met := [c for c in found if worst[c] <= 1]:
             return min(met, key=self.predict)
+        near = [c for c in found if self.predict(c) <= STAKE * left]
+        if told := [c for c in near if math.isfinite(worst[c])]:
+            return min(told, key=lambda c: worst[c])
         # what is not resolved tells no more than that both have to be finer
-        bounded = [c for c in found if c.size >= now.size / 2 - 1e-9 and c.dt >= now.dt / 2 - 1e-9]
-        return min(bounded, key=lambda c: (worst[c] * self.predict(c) ** 0.3 if math.isfinite(worst[c]) else 1e9, c.size * c.dt))
+        return min((c for c in near if c.size >= now.size / 2 - 1e-9 and c.dt >= now.dt / 2 - 1e-9),
+                   key=lambda c: (max(c.size / now.size, c.dt / now.dt), c.size * c.dt), default=None)
 
     def met(self):
         return bool(self.outcomes) and all(self.share(key) <= share for key, share in self.asked.items())
@@ -227,7 +237,7 @@ class Goal:
         """Runs until the bars are within what is asked, or the budget is used. False: no sweep is possible here."""
         self.made = set()
         o = self.options
-        dt = o.dt or float(settings.of_files([*self.scene, *o.flags], "-ts_dt", "0.05"))
+        dt = o.dt or max(FIRST_STEP, float(settings.of_files([*self.scene, *o.flags], "-ts_dt", "0")))
         if o.meshes or settings.of_files([*self.scene, *o.flags], "-dm_plex_filename") and not o.lung:
             path = str((o.meshes or [settings.of_files([*self.scene, *o.flags], "-dm_plex_filename")])[0])
             choice = Choice(1.0, dt, mesh=path)
@@ -237,8 +247,8 @@ class Goal:
             if self.met() or len(self.outcomes) >= MOST_RUNS:
                 return True
             choice = self.next()
-            if self.spent + self.predict(choice) > o.budget:
-                print(f"{choice.name} would take about {self.predict(choice):.0f} s: more than the budget leaves", flush=True)
+            if not choice:
+                print("what is finer would take more than the budget leaves", flush=True)
                 return True
         return bool(self.outcomes)
 
@@ -247,13 +257,19 @@ class Goal:
         for key, share in self.asked.items():
             texts.append(f"{'' if self.met() else 'NOT within ' + percent(share) + ': '}{self.value(key)}; {self.last.run[self.options.clock]:.3g} s "
                          f"with its sweep, {self.spent:.3g} s in all ({self.options.clock})")
-        tenth = Goal(dict.fromkeys(self.asked, 0), self.scene, self.options)
-        tenth.outcomes, tenth.asked = self.outcomes, {key: share / 10 for key, share in self.asked.items()}
-        choice = tenth.next()
-        texts.append(f"{', '.join(f'{short(k)} within {percent(s)}' for k, s in tenth.asked.items())} would take about "
-                     f"{tenth.predict(choice):.2g} s ({choice.name})" if all(
-                         tenth.promised(k, choice) <= s for k, s in tenth.asked.items()) else "a tenth of that is out of reach from here")
+        texts += self.cost_of_a_tenth()
         return texts
+
+    def cost_of_a_tenth(self):
+        """What the tenth of each share would take."""
+        further = copy.copy(self)
+        further.asked = {key: share / 10 for key, share in self.asked.items()}
+        further.options = argparse.Namespace(**{**vars(self.options), "budget": math.inf})
+        choice = further.next()
+        if not choice or any(further.promised(key, choice) > share for key, share in further.asked.items()):
+            return []
+        what = ", ".join(f"{short(key)} within {percent(share)}" for key, share in further.asked.items())
+        return [f"{what} would take about {further.predict(choice):.2g} s ({choice.name})"]
 
     def write(self, command):
         """The folder: README.md and, where the question is answered, the options of the last run."""
@@ -281,4 +297,4 @@ class Goal:
 
 
 SWEPT = {**SHORT, "plateau_pressure_cmH2O": "P_plat", "peak_expiratory_flow_ml_per_s": "Q_exp", "work_j": "work"}
-SEEN, FACTOR, LARGEST = 0.75, 0.75, 0.1  # as in pulmo/observers/error_bars.hpp; the bar of a corrected value over its parts
+SEEN, FACTOR, LARGEST = 0.75, 0.5, 0.1  # as in pulmo/observers/error_bars.hpp; the bar of a corrected value over its parts

@@ -133,7 +133,8 @@ def accuracy(case, given):
     say(f"looking for what gives {given.within}, in at most {given.budget or BUDGET}")
     folder = case.folder / "accuracy"
     command = [SOURCE / "tools/accuracy_cost", "scene.opts", "--meshes", case.done["mesh"]["file"], "--question", given.within, "--budget", given.budget or BUDGET,
-               "--build", given.build.resolve(), "--output", "accuracy", "--solvers", "solver.opts", "--", "-options_file", "own.opts"]
+               "--build", given.build.resolve(), "--output", "accuracy", "--solvers", "solver.opts",
+               "--method", "auto", "--", "-options_file", "own.opts"]
     told(command, case.folder / "accuracy.txt", "tools/accuracy_cost", cwd=case.folder)
     recommended = sorted(folder.glob("recommended_*.opts"))
     if not recommended:
