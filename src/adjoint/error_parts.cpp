@@ -72,6 +72,7 @@ PetscErrorCode ErrorParts::setup(std::size_t count)
   PetscCall(DMGetNumFields(model_.dm(), &fields));
   gas_ = fields > pressure;
   lacking_.assign(count, {});
+  rough_.assign(count, 0);
   for (ByCell *part : {&solver_, &time_, &flow_part_, &tissue_part_})
     part->assign(count, std::vector<PetscReal>(cells, 0));
   PetscCall(DMCreateLocalVector(model_.dm(), state_.out()));
@@ -88,21 +89,10 @@ PetscErrorCode ErrorParts::setup(std::size_t count)
     const PetscInt middle = (begin + end) / 2;
     sampled_[middle] = time * stages[static_cast<std::size_t>(middle)].stage.slope;
   }
-  volumes_.assign(stages.size(), 0);
-  for (std::size_t n = 1; n < stages.size(); ++n) {
-    Measures measures;
-    if (stages[n].row >= 0) {
-      volumes_[n] = simulation_.rows()[static_cast<std::size_t>(stages[n].row)].volume * units::mm3_per_ml;
-      continue;
-    }
-    PetscCall(trajectory_.state(static_cast<PetscInt>(n), state_));
-    PetscCall(model_.measure(state_, measures));
-    volumes_[n] = measures.volume_change;
-  }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-std::vector<std::pair<PetscInt, PetscReal>> ErrorParts::better_rate(PetscInt number)
+ErrorParts::Changes ErrorParts::better_rate(PetscInt number, bool &rough) const
 {
   const auto &stages = trajectory_.stages();
   const StageRecord &record = stages[static_cast<std::size_t>(number)];
@@ -122,10 +112,8 @@ std::vector<std::pair<PetscInt, PetscReal>> ErrorParts::better_rate(PetscInt num
     return list;
   };
   std::vector<PetscInt> list = window(false);
-  if (list.size() < wanted) {
-    time_resolved_ = false;
-    list = window(true);
-  }
+  rough = list.size() < wanted;
+  if (rough) list = window(true);
   std::map<PetscInt, PetscReal> weights;
   if (list.size() >= 2) {
     const std::size_t n = std::min(wanted, list.size()),
@@ -155,21 +143,37 @@ PetscErrorCode ErrorParts::add_solver(const Sweep::Solved &stage)
 
 PetscErrorCode ErrorParts::add_time(const Sweep &sweep, const Sweep::Solved &stage)
 {
-  const StageRecord &record = stage.record;
-  const auto changes = better_rate(stage.number);
+  bool rough;
+  const auto changes = better_rate(stage.number, rough);
   PetscReal flow = 0;
+  std::vector<PetscReal> before, after;
   ByCell parts;
 
   PetscFunctionBeginUser;
+  if (rough) PetscCall(total(time_, before));
   for (const auto &[number, weight] : changes) {
-    flow += weight * volumes_[static_cast<std::size_t>(number)];
+    flow += weight * sweep.volume(number);
     if (!gas_) continue;
     PetscCall(trajectory_.state(number, state_));
     PetscCall(model_.weighted_volume(state_, stage.adjoint, parts));
     add(weight * model_.row_scale(pressure), parts, time_);
   }
   for (std::size_t k = 0; k < lacking_.size(); ++k) lacking_[k].steps += stage.by_flow[k] * flow;
-  if (!sweep.other_rates()) PetscFunctionReturn(PETSC_SUCCESS);
+  if (sweep.other_rates()) PetscCall(add_other_rates(stage, changes));
+  if (!rough) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(total(time_, after));
+  for (std::size_t k = 0; k < lacking_.size(); ++k)
+    rough_[k] += std::abs(after[k] - before[k] + stage.by_flow[k] * flow);
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Of rates that act by more than the gas that is stored.
+PetscErrorCode ErrorParts::add_other_rates(const Sweep::Solved &stage, const Changes &changes)
+{
+  const StageRecord &record = stage.record;
+  ByCell parts;
+
+  PetscFunctionBeginUser;
   VecHandle better; // of a multistep stage: the gas does not see it
   Stage told = record.stage;
   told.multistep = true;

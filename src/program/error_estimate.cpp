@@ -27,6 +27,9 @@ constexpr double same_lung = 0.1;
 /// land on the ends of phases.
 constexpr double least_coarsening = 1.2;
 
+/// Where more than this share of a number is a guess of a sweep's part in time, that part is not resolved.
+constexpr double guessed = 1e-3;
+
 /// Solver tolerances are tightened by this factor, but not to rounding.
 constexpr PetscReal tighter = 0.01, tightest = 1e-12;
 
@@ -412,7 +415,8 @@ PetscErrorCode ErrorEstimate::make_by_sweep(const Options &options, const Scene 
   }
   for (std::size_t k = 0; k < functionals.size(); ++k)
     report.bars.push_back(
-        lacking_bar(entries[k], parts.lacking()[k], largest_share, parts.time_resolved() && functionals[k].resolved));
+        lacking_bar(entries[k], parts.lacking()[k], largest_share,
+                    functionals[k].resolved && parts.rough_in_time(k) <= guessed * std::abs(*entries[k].value)));
   if (report.failure.empty() && !functionals.empty()) PetscCall(fields.write_cells("errors", in_space));
   PetscCall(PetscTime(&end));
   report.sweep_seconds = end - begin;

@@ -33,8 +33,8 @@ public:
   const std::vector<LackingParts> &lacking() const { return lacking_; }
   /// [number][cell of this rank]: the part in space.
   const std::vector<std::vector<PetscReal>> &in_space() const { return in_space_; }
-  /// Whether each phase that counts has as many steps as the part in time needs.
-  bool time_resolved() const { return time_resolved_; }
+  /// What phases with too few steps add to the part in time of number @p k, in sizes: so much of it is a guess.
+  PetscReal rough_in_time(std::size_t k) const { return rough_[k]; }
 
 private:
   using ByCell = std::vector<std::vector<PetscReal>>;
@@ -48,19 +48,22 @@ private:
   PetscErrorCode add_solver(const Sweep::Solved &stage);
   PetscErrorCode add_time(const Sweep &sweep, const Sweep::Solved &stage);
   PetscErrorCode add_space(const Sweep::Solved &stage);
-  /// Stages, and by how much their weight in a better rate of @p stage exceeds that in its own, 1/s.
-  std::vector<std::pair<PetscInt, PetscReal>> better_rate(PetscInt number);
+  /// Stages, and by how much their weight in a better rate of a stage exceeds that in its own, 1/s.
+  using Changes = std::vector<std::pair<PetscInt, PetscReal>>;
+  /// @p rough: there are too few between two kinks.
+  Changes better_rate(PetscInt number, bool &rough) const;
+  PetscErrorCode add_other_rates(const Sweep::Solved &stage, const Changes &changes);
   PetscErrorCode total(const ByCell &parts, std::vector<PetscReal> &sums) const;
 
   const Scene &scene_;
   Model &model_;
   Simulation &simulation_;
   const Trajectory &trajectory_;
-  bool gas_ = false, time_resolved_ = true;
+  bool gas_ = false;
   std::optional<Enrichment> flow_, tissue_;
   std::map<PetscInt, PetscReal> sampled_;       ///< stages where the displacement is looked at, and whom they stand for
   std::map<PetscInt, std::vector<Kept>> later_; ///< [stage]
-  std::vector<PetscReal> volumes_;              ///< [stage], mm^3
+  std::vector<PetscReal> rough_;                ///< [number]
   std::vector<LackingParts> lacking_;
   ByCell solver_, time_, flow_part_, tissue_part_, in_space_;
   VecHandle state_; ///< local

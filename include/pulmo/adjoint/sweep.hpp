@@ -68,6 +68,8 @@ public:
   void heed(StopRequest &request) { stop_request_ = &request; }
   bool stopped() const { return stopped_; }
 
+  /// Of a stage, mm^3 above rest; once the sweep has begun.
+  PetscReal volume(PetscInt stage) const { return volumes_[static_cast<std::size_t>(stage)]; }
   PetscInt solves() const { return solves_; }
   PetscInt krylov() const { return krylov_; }
 
