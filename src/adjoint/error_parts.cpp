@@ -234,6 +234,8 @@ PetscErrorCode ErrorParts::visit(const Sweep &sweep, const Sweep::Solved &stage)
   PetscFunctionBeginUser;
   PetscCall(model_.set_step(record.stage, record.airway.pressure, record.airway.flow));
   if (!flow_) PetscCall(add_solver(stage));
+  for (std::size_t k = 0; k < lacking_.size(); ++k)
+    lacking_[k].solver += stage.opening[k] * sweep.left_at_opening(stage);
   PetscCall(add_time(sweep, stage));
   PetscCall(add_space(stage));
   PetscFunctionReturn(PETSC_SUCCESS);

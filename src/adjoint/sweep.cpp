@@ -385,16 +385,32 @@ PetscErrorCode Sweep::right_side(const StageRecord &record, std::size_t k, Wante
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscReal Sweep::volume_rate(const StageRecord &record, PetscInt number) const
+{
+  PetscReal Q = record.stage.slope * volume(number);
+  for (int i = 0; i < 2; ++i)
+    if (record.past[i] >= 0) Q += record.weight[i] * volume(record.past[i]);
+  return Q;
+}
+
+PetscReal Sweep::left_at_opening(const Solved &stage) const
+{
+  const Airway::Condition &airway = stage.record.airway;
+  const PetscReal L = model_.composition().mesh().length();
+  const auto &tube = scene_.facts().tube;
+  if (airway.mode != Airway::Mode::solved) return 0;
+  if (airway.control == Control::flow) return (volume(stage.number) - airway.target) / (L * L * L);
+  const PetscReal drop = tube ? tube->drop(volume_rate(stage.record, stage.number)) : 0;
+  return (airway.pressure + drop - airway.target) / model_.modulus();
+}
+
 /// Derivatives of the equation c(P, V) = 0 of the pressure at the opening (Airway::equation).
 Sweep::Opening Sweep::opening(const StageRecord &record, PetscInt number) const
 {
   const PetscReal L = model_.composition().mesh().length(), h3 = L * L * L, modulus = model_.modulus();
   const auto &tube = scene_.facts().tube;
   if (record.airway.control == Control::flow) return {0, 1 / h3, 0, -1 / h3};
-  PetscReal Q = record.stage.slope * volumes_[static_cast<std::size_t>(number)];
-  for (int i = 0; i < 2; ++i)
-    if (record.past[i] >= 0) Q += record.weight[i] * volumes_[static_cast<std::size_t>(record.past[i])];
-  const PetscReal by_flow = tube ? tube->slope(Q) / modulus : 0;
+  const PetscReal by_flow = tube ? tube->slope(volume_rate(record, number)) / modulus : 0;
   return {1 / modulus, by_flow * record.stage.slope, by_flow, -1 / modulus};
 }
 

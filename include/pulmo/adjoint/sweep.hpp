@@ -68,6 +68,8 @@ public:
   void heed(StopRequest &request) { stop_request_ = &request; }
   bool stopped() const { return stopped_; }
 
+  /// What the solver left of the equation c(P, V) = 0 of the pressure at the opening, where that is an unknown.
+  PetscReal left_at_opening(const Solved &stage) const;
   /// Of a stage, mm^3 above rest; once the sweep has begun.
   PetscReal volume(PetscInt stage) const { return volumes_[static_cast<std::size_t>(stage)]; }
   PetscInt solves() const { return solves_; }
@@ -105,6 +107,8 @@ private:
   PetscErrorCode assemble(const StageRecord &record, PetscInt number);
   PetscErrorCode right_side(const StageRecord &record, std::size_t k, Wanted &w, Pending &pending, Vec right);
   Opening opening(const StageRecord &record, PetscInt number) const;
+  /// Rate of the volume by the time scheme, mm^3/s.
+  PetscReal volume_rate(const StageRecord &record, PetscInt number) const;
   PetscErrorCode solve_border(const Opening &c, std::string &failure);
   PetscErrorCode solve_stage(const StageRecord &record, const Opening &c, std::size_t k, const Wanted &w, Vec right,
                              Pending &pending, Solved &result, std::string &failure);
