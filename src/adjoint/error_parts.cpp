@@ -44,6 +44,8 @@ std::string ErrorParts::obstacle(const Scene &scene, const Model &model)
   if (!sweep.empty()) return sweep;
   const Composition &composition = model.composition();
   if (!Enrichment::exists(composition.elements())) return "needs richer elements than the run's: give -elements P2-P1";
+  if (scene.facts().pressure_damping) // an error of the cells' size that stays with richer elements
+    return "does not see what -pressure_damping does to the numbers";
   if (!composition.memories().empty())
     return "does not know richer elements for what -" + composition.memories().front().effect + " remembers";
   return "";

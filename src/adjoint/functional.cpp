@@ -73,6 +73,8 @@ double rise_between(const Breath &b, std::size_t i, const std::function<double(c
 {
   const std::vector<std::size_t> ends = stretches(b.rows, b.kinks);
   if (i <= b.first || i >= b.last || std::find(ends.begin(), ends.end(), i) != ends.end()) return 0;
+  const double most = value(b.rows[i]), plain = rounding * std::abs(most);
+  if (most - value(b.rows[i - 1]) <= plain || most - value(b.rows[i + 1]) <= plain) return 0; // prescribed, and stays
   const double s = b.rows[i].time - b.rows[i - 1].time, t = b.rows[i + 1].time - b.rows[i].time, y = value(b.rows[i]),
                before = (y - value(b.rows[i - 1])) / s, after = (value(b.rows[i + 1]) - y) / t,
                curvature = (after - before) / (s + t), slope = before + curvature * s;
@@ -85,6 +87,30 @@ bool is_resolved(const Breath &b, std::size_t i, const std::function<double(cons
   constexpr double plain = 0.02; // what is prescribed stays
   const bool first = i == b.first + 1 || b.rows[i - 1].phase != b.rows[i].phase;
   return !first || i == b.last || value(b.rows[i + 1]) > (1 - plain) * value(b.rows[i]);
+}
+
+/// Whether the flow moves the way the pressure does at each jump of it: a multistep rate through one may not, and what
+/// its rows add to a fit is then no curve that more rows would follow.
+bool follows_jumps(const Breath &b)
+{
+  constexpr double counts = 0.1; // of the breath's range of pressures
+  double most = b.rows[b.first].machine_pressure(), least = most, fastest = 0;
+  for (std::size_t i = b.first; i <= b.last; ++i) {
+    most = std::max(most, b.rows[i].machine_pressure());
+    least = std::min(least, b.rows[i].machine_pressure());
+    fastest = std::max(fastest, std::abs(b.rows[i].flow));
+  }
+  const std::vector<std::size_t> ends = stretches(b.rows, b.kinks);
+  for (const std::size_t i : ends) {
+    if (i < b.first || i + 2 > b.last) continue;
+    const double jump = b.rows[i + 1].machine_pressure() - b.rows[i].machine_pressure(),
+                 next = b.rows[i + 2].machine_pressure() - b.rows[i + 1].machine_pressure(),
+                 change = b.rows[i + 1].flow - b.rows[i].flow;
+    if (std::abs(jump) > counts * (most - least) && std::abs(next) < std::abs(jump) / 2 &&
+        std::copysign(1, jump) * change < -rounding * fastest)
+      return false;
+  }
+  return true;
 }
 
 /// The largest size of @p value in all rows.
@@ -179,6 +205,7 @@ bool compliance(const Breath &b, Functional &f)
   if (!b.numbers.compliance || !b.numbers.resistance) return false; // a fit without flow is another one
   f.value = *b.numbers.compliance;
   f.better_value = extrapolated(f.value, overall_numbers(every_other(b.rows, b.kinks)).compliance);
+  f.resolved = follows_jumps(b);
   add_fit(b, -f.value * f.value, 0, f);
   return true;
 }
@@ -188,6 +215,7 @@ bool resistance(const Breath &b, Functional &f)
   if (!b.numbers.compliance || !b.numbers.resistance) return false;
   f.value = *b.numbers.resistance;
   f.better_value = extrapolated(f.value, overall_numbers(every_other(b.rows, b.kinks)).resistance);
+  f.resolved = follows_jumps(b);
   add_fit(b, 0, 1000, f);
   return true;
 }

@@ -16,6 +16,10 @@ constexpr double seen_by_richer = 0.75;
 /// Of the bar of a sweep: over its parts, of the corrected value over that, and the largest part that is one.
 constexpr double swept_factor = 1.5, corrected_share = 1. / 3, largest_part = 0.1;
 
+/// Where some number is off by more than so many times its own size no estimate of first order is worth anything; but a
+/// share below the second of a number that is prescribed stays rounding.
+constexpr double worthless = 3, plain = 1e-6;
+
 } // namespace
 
 double space_share(const ClinicalEntry &entry, const LackingParts &parts)
@@ -24,7 +28,8 @@ double space_share(const ClinicalEntry &entry, const LackingParts &parts)
   return space == 0 ? 0 : space / std::abs(*entry.value);
 }
 
-ErrorBar lacking_bar(const ClinicalEntry &entry, const LackingParts &parts, double largest_share, bool time_resolved)
+ErrorBar lacking_bar(const ClinicalEntry &entry, const LackingParts &parts, double largest_share,
+                     const std::string &trouble_in_time)
 {
   const double value = *entry.value, time = std::abs(parts.steps) + std::abs(parts.rows),
                space = space_share(entry, parts);
@@ -33,13 +38,13 @@ ErrorBar lacking_bar(const ClinicalEntry &entry, const LackingParts &parts, doub
   bar.entry = entry;
   bar.lacks = parts;
   bar.solver = std::abs(parts.solver);
-  if (!time_resolved)
-    bar.unresolved = "steps too long for its phases";
+  if (!trouble_in_time.empty())
+    bar.unresolved = trouble_in_time;
   else if (!(time <= largest_part * std::abs(value)))
     bar.unresolved = "steps too long";
   else
     bar.time = swept_factor * time;
-  if (space <= largest_part)
+  if (space <= largest_part && (largest_share <= worthless || space < plain))
     bar.space = swept_factor * (1 + std::min(1., largest_share)) * space * std::abs(value);
   else
     bar.unresolved += (bar.unresolved.empty() ? "" : ", ") + std::string("cells too large");

@@ -39,6 +39,9 @@ enum { fine, other, twice, four_times, tight, n_levels };
 /// What each step leaves undone may add up, and the solver is judged by runs of so many times fewer steps.
 constexpr double steps_saved = 4;
 
+/// A phase that one of these ends does so with a step, up to one late, and no part in time sees that.
+constexpr char ends_with_a_step[] = "phases ended by a trigger or by cycling";
+
 std::string text_of(double v)
 {
   std::ostringstream s;
@@ -51,6 +54,13 @@ std::string text_of(double v)
 double cell_size_ratio(const ErrorLevel &level, const ErrorLevel &other)
 {
   return std::cbrt(other.volume / static_cast<double>(other.cells) / (level.volume / static_cast<double>(level.cells)));
+}
+
+/// Whether a condition may have ended a phase of the run before its time.
+bool ended_early(const Scene &scene, const std::vector<SignalRow> &rows)
+{
+  const Programme &programme = *scene.facts().ventilator;
+  return programme.may_end_early() && rows.back().time < programme.phases().back().end - rows.back().dt / 1000;
 }
 
 /// The values of number @p i on both levels, if both have it.
@@ -358,8 +368,12 @@ PetscErrorCode ErrorEstimate::make(const Options &options, const Output &output,
   }
   // phases may be shorter than the longer steps
   const auto coarser = [&](int a, int b) { return levels[a].steps > least_coarsening * levels[b].steps; };
-  const bool longer = coarser(fine, twice) && coarser(twice, four_times);
-  if (!longer && levels[twice].failure.empty() && levels[four_times].failure.empty())
+  const bool early = ended_early(scene, simulation.rows()),
+             longer = !early && coarser(fine, twice) && coarser(twice, four_times);
+  if (early && levels[twice].failure.empty())
+    levels[twice].failure = std::string("no error in time: ") + ends_with_a_step +
+                            " end up to a step late; a run with a smaller -ts_dt tells";
+  else if (!longer && levels[twice].failure.empty() && levels[four_times].failure.empty())
     levels[twice].failure = "its steps are hardly longer, as the phases are too short for that: no error in time; a "
                             "run with a smaller -ts_dt tells";
   for (std::size_t i = 0; i < numbers.size(); ++i)
@@ -392,7 +406,19 @@ PetscErrorCode ErrorEstimate::make_by_sweep(const Options &options, const Scene 
   if (!report.failure.empty()) PetscFunctionReturn(PETSC_SUCCESS);
   for (const std::string &name : names_.empty() ? functional_names() : names_) {
     const auto f = functional(name, rows, parts.kinks());
-    if (f) functionals.push_back(*f);
+    if (f)
+      functionals.push_back(*f);
+    else if (!names_.empty())
+      PetscCall(PetscPrintf(comm, "pulmo: note: -error_estimate_numbers: this run has no %s\n", name.c_str()));
+  }
+  const std::size_t asked = functionals.size();
+  // R tells best of cells that are too large, for the other numbers too
+  const auto witness = functional("R", rows, parts.kinks());
+  if (asked > 0 && witness && std::find(names_.begin(), names_.end(), "R") == names_.end() && !names_.empty())
+    functionals.push_back(*witness);
+  if (functionals.empty()) {
+    report.failure = "the run has none of the numbers";
+    PetscFunctionReturn(PETSC_SUCCESS);
   }
   StopSignal signal(comm);
   sweep.heed(signal);
@@ -402,6 +428,7 @@ PetscErrorCode ErrorEstimate::make_by_sweep(const Options &options, const Scene 
   PulmoFailureCheck(!sweep.stopped(), comm,
                     "stopped by %s while the errors were estimated; the run itself is whole, without error bars",
                     signal.name());
+  if (!report.failure.empty()) PetscFunctionReturn(PETSC_SUCCESS); // its parts are of some steps only
   std::vector<ClinicalEntry> entries;
   double largest_share = 0;
   for (std::size_t k = 0; k < functionals.size(); ++k) {
@@ -411,13 +438,15 @@ PetscErrorCode ErrorEstimate::make_by_sweep(const Options &options, const Scene 
                functionals[k].key.c_str());
     entries.push_back(*entry);
     largest_share = std::max(largest_share, space_share(*entry, parts.lacking()[k]));
-    in_space.emplace_back("lacks_in_space_" + functionals[k].key, parts.in_space()[k]);
+    if (k < asked) in_space.emplace_back("lacks_in_space_" + functionals[k].key, parts.in_space()[k]);
   }
-  for (std::size_t k = 0; k < functionals.size(); ++k)
-    report.bars.push_back(
-        lacking_bar(entries[k], parts.lacking()[k], largest_share,
-                    functionals[k].resolved && parts.rough_in_time(k) <= guessed * std::abs(*entries[k].value)));
-  if (report.failure.empty() && !functionals.empty()) PetscCall(fields.write_cells("errors", in_space));
+  const bool early = ended_early(scene, simulation.rows());
+  for (std::size_t k = 0; k < asked; ++k) {
+    const bool resolved = functionals[k].resolved && parts.rough_in_time(k) <= guessed * std::abs(*entries[k].value);
+    const std::string trouble = early ? ends_with_a_step : resolved ? "" : "steps too long for its phases";
+    report.bars.push_back(lacking_bar(entries[k], parts.lacking()[k], largest_share, trouble));
+  }
+  PetscCall(fields.write_cells("errors", in_space));
   PetscCall(PetscTime(&end));
   report.sweep_seconds = end - begin;
   PetscFunctionReturn(PETSC_SUCCESS);

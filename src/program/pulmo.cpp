@@ -325,6 +325,12 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
       PetscCall(PetscPrintf(comm,
                             "  The sweep of -sensitivities comes on top: from half as long as the run (one number) to "
                             "two or three times as long (all eight).\n"));
+    if (error_estimate.in_use())
+      PetscCall(PetscPrintf(comm, "  %s\n",
+                            error_estimate.sweeps()
+                                ? "The sweep of -error_estimate comes on top: from half as long as the run (one "
+                                  "number) to two or three times as long (all eight)."
+                                : "The four more runs of -error_estimate come on top, one of them with another mesh."));
     finished = true;
     PetscFunctionReturn(PETSC_SUCCESS);
   }

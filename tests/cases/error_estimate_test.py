@@ -159,6 +159,7 @@ class ErrorEstimate(unittest.TestCase):
         said(SCENE + SWEEP + ["-error_estimate_numbers", "V_T,tau"], "-error_estimate_numbers", "'tau'")
         said(SCENE + ESTIMATE + ["-error_estimate_numbers", "V_T"], "-error_estimate_numbers", "method sweep")
         said(SCENE + SWEEP + ["-elements", "P3-P2"], "-error_estimate_method sweep", "-elements P2-P1")
+        said(SCENE + SWEEP + ["-pressure_damping"], "-error_estimate_method sweep", "-pressure_damping")
         said(SCENE + SWEEP + ["-error_estimate_mesh", pc.mesh("cube.msh")], "-error_estimate_method sweep", "-error_estimate_mesh")
         said(SCENE + ["-error_estimate_mesh", "x.msh"], "-error_estimate_mesh x.msh", "-error_estimate")
         case = said(SCENE + ESTIMATE + ["-error_estimate_mesh", "none.msh"], "-error_estimate_mesh none.msh", "no such file")
@@ -275,6 +276,75 @@ class SweptErrors(unittest.TestCase):
         bar = bars(pc.finished(scene + STEPS + SWEEP))["peak_expiratory_flow_ml_per_s"]
         self.assertIsNone(bar["time"])
         self.assertIn("steps too long", bar["not_resolved"])
+
+    def test_a_sweep_that_fails(self):
+        """Linear systems that are not solved: the reason, and no bars of the steps that were."""
+        case = pc.finished(SCENE + STEPS + SWEEP + ["-ksp_type", "gmres", "-pc_type", "jacobi", "-ksp_max_it", "60", "-ksp_rtol", "1e-3",
+                                                    "-sweep_rtol", "1e-10"])
+        estimate = case.json()["error_estimate"]
+        self.assertIn("linear system of the sweep", estimate["failure"])
+        self.assertEqual(estimate["numbers"], {})
+        self.assertIn("no error estimate", case.out)
+        self.assertNotIn("errors.h5", case.files())
+
+    def test_phases_that_end_early(self):
+        """A phase that cycling ends does so up to a step late: V_T is off by more than its rates tell, and has no part in time."""
+        air = [o for o in SCENE]
+        del air[air.index("-ventilator"):air.index("-energy_audit")]
+        breath = "inspiration 1.5 pressure 5 ramp 0.2 cycle {0}\nexpiration 1 pressure 2 ramp 0.2\n"
+        text = "settle 1 pressure 2 ramp 0.5\n" + 2 * breath
+        for method in (SWEEP, ESTIMATE):
+            case = pc.finished(air + pc.programme(text.format(30)) + STEPS + method)
+            for key in ("tidal_volume_ml", "compliance_ml_per_cmH2O"):
+                self.assertIsNone(bars(case)[key]["time"])
+                self.assertIsNone(bars(case)[key]["error"])
+            self.assertIn("phases ended by a trigger or by cycling", case.out)
+        late = bars(pc.finished(air + pc.programme(text.format(0.01)) + STEPS + SWEEP))["tidal_volume_ml"]
+        self.assertIsNotNone(late["time"], "no phase ended early")
+
+    def test_flow_against_a_jump(self):
+        """BDF2 through a pressure that is released at once: rows of gas that flows in, which a fit takes for a lung's."""
+        scene = [o for o in SCENE if o not in ("-ventilator_pip", "8")]
+        scene[scene.index("pcv")] = "vcv"
+        scene[scene.index("-airflow_permeability") + 1] = "1000"
+        for option in ("-ventilator_ramp", "-ventilator_ramp_down"):
+            del scene[scene.index(option):scene.index(option) + 2]
+        scene += ["-ventilator_tidal_volume", "20", "-ventilator_inspiration", "0.6", "-ventilator_pause", "0.3"] + STEPS
+        two = pc.finished(scene + BDF2 + SWEEP)
+        rows = two.signals()
+        self.assertGreater(rows["flow_ml_per_s"][rows["phase"].index("expiration")], 1, "the wrong way")
+        for key in ("compliance_ml_per_cmH2O", "resistance_cmH2O_s_per_l"):
+            self.assertIsNone(bars(two)[key]["time"])
+            self.assertIn("steps too long", bars(two)[key]["not_resolved"])
+        # a flow that is prescribed has no peak between its rows
+        one = bars(pc.finished(scene + SWEEP))["peak_flow_ml_per_s"]
+        self.assertEqual(one["lacks"]["rows"], 0)
+        self.assertLess(one["time"], 1e-6 * one["value"])
+
+    def test_cells_far_too_large(self):
+        """Gas that goes nowhere within a cell: R of the run is a fiftieth of the true one, and C_rs, whose own parts are small, twice it."""
+        scene = [o for o in SCENE]
+        scene[scene.index("-airflow_permeability") + 1] = "1"
+        case = pc.finished(scene + ["-ts_dt", "0.1", "-ventilator_pip", "4"] + SWEEP)
+        for key in ("resistance_cmH2O_s_per_l", "compliance_ml_per_cmH2O"):
+            self.assertIsNone(bars(case)[key]["space"])
+            self.assertIn("cells too large", bars(case)[key]["not_resolved"])
+        self.assertIsNotNone(bars(case)["peak_inspiratory_pressure_cmH2O"]["error"], "prescribed")
+        alone = bars(pc.finished(scene + ["-ts_dt", "0.1", "-ventilator_pip", "4"] + SWEEP + ["-error_estimate_numbers", "C_rs"]))
+        self.assertEqual(list(alone), ["compliance_ml_per_cmH2O"])
+        self.assertIsNone(alone["compliance_ml_per_cmH2O"]["space"])
+
+    def test_numbers_that_the_run_has_not(self):
+        some = pc.finished(SCENE + STEPS + SWEEP + ["-error_estimate_numbers", "P_plat,V_T"])
+        self.assertEqual(list(bars(some)), ["tidal_volume_ml"])
+        self.assertIn("this run has no P_plat", some.out)
+        none = pc.finished(SCENE + STEPS + SWEEP + ["-error_estimate_numbers", "P_plat"])
+        self.assertIn("no error estimate", none.out)
+        self.assertIn("none of the numbers", none.json()["error_estimate"]["failure"])
+
+    def test_dry_run(self):
+        for method, words in ((SWEEP, "The sweep of -error_estimate comes on top"), (ESTIMATE, "The four more runs of -error_estimate")):
+            self.assertIn(words, pc.finished(SCENE + STEPS + method + ["-dry_run"]).out)
 
 
 if __name__ == "__main__":

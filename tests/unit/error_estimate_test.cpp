@@ -75,7 +75,7 @@ TEST(LackingBar, CountsPartsThatMayCancelApart)
   parts.flow_in_space = -6;
   parts.tissue_in_space = 3;
   parts.solver = -0.5;
-  const ErrorBar bar = lacking_bar(entry, parts, 0.2, true);
+  const ErrorBar bar = lacking_bar(entry, parts, 0.2, "");
   EXPECT_NEAR(*bar.time, 1.5 * 4, 1e-12);
   EXPECT_NEAR(*bar.space, 1.2 * 1.5 * 9 / 0.75, 1e-12);
   EXPECT_NEAR(*bar.solver, 0.5, 1e-12);
@@ -90,16 +90,23 @@ TEST(LackingBar, SaysWhatIsNotResolved)
   LackingParts parts;
   parts.flow_in_space = 40; // 53 of 500
   EXPECT_NEAR(space_share(entry, parts), 40 / 0.75 / 500, 1e-12);
-  ErrorBar bar = lacking_bar(entry, parts, 0.2, true);
+  ErrorBar bar = lacking_bar(entry, parts, 0.2, "");
   EXPECT_FALSE(bar.space);
   EXPECT_FALSE(bar.total());
   EXPECT_FALSE(bar.corrected);
   EXPECT_EQ(bar.unresolved, "cells too large");
-  bar = lacking_bar(entry, parts, 0.2, false);
+  bar = lacking_bar(entry, parts, 0.2, "steps too long for its phases");
   EXPECT_FALSE(bar.time);
   EXPECT_EQ(bar.unresolved, "steps too long for its phases, cells too large");
+  parts.flow_in_space = 4; // 1 %, but another number is off by several times itself
+  EXPECT_TRUE(lacking_bar(entry, parts, 3, "").space);
+  bar = lacking_bar(entry, parts, 3.1, "");
+  EXPECT_FALSE(bar.space);
+  EXPECT_EQ(bar.unresolved, "cells too large");
+  parts.flow_in_space = 1e-12; // prescribed
+  EXPECT_TRUE(lacking_bar(entry, parts, 3.1, "").space);
   parts.steps = std::nan("");
-  EXPECT_FALSE(lacking_bar(entry, parts, 0.2, true).time);
+  EXPECT_FALSE(lacking_bar(entry, parts, 0.2, "").time);
 }
 
 } // namespace

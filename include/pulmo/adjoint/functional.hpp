@@ -19,7 +19,8 @@ struct Functional {
   /// What more rows on the same curves would make of it: sums extrapolated from those over every other row, and largest
   /// values by a parabola through three rows.
   double better_value = 0;
-  /// False: the largest value is that of the first step of its phase, and may have no limit as steps get shorter.
+  /// False: the largest value is that of the first step of its phase, and may have no limit as steps get shorter; or a
+  /// fit has rows whose flow goes the wrong way after a jump of pressure.
   bool resolved = true;
   /// [row], in the number's unit per ml, per cmH2O of the pressure at the machine, and per ml/s.
   std::vector<double> by_volume, by_pressure, by_flow;
