@@ -392,11 +392,15 @@ class Tool(unittest.TestCase):
         self.assertEqual(again.stdout[again.stdout.index("wrote "):].split(";")[0], last.split(";")[0])
 
     def test_no_answer_by_sweeps(self):
-        call = ["pcv", "--build", os.path.dirname(pulmo.PROGRAM), "--output", pulmo.scratch(), "--method", "sweep", "--meshes",
+        air = pathlib.Path(pulmo.scratch() + ".opts")
+        air.write_text("-airflow\n-airflow_surfaces x1\n-chest_wall\n-chest_wall_surfaces x0,y0,y1,z0,z1\n-mesh_scale 100\n")
+        cycled = [*pulmo.PAPER, *pulmo.programme("inspiration 1.5 pressure 5 ramp 0.2 cycle 30\nexpiration 1 pressure 0 ramp 0.2\n")]
+        call = ["--build", os.path.dirname(pulmo.PROGRAM), "--output", pulmo.scratch(), "--method", "sweep", "--solvers", "direct", "--meshes",
                 pulmo.mesh("cube_coarse.msh")]
         for more, said in ((["--question", "V_T=4%", "--", *SCENE, "-viscoelastic"], "-viscoelastic"), (["--", *SCENE], "--question"),
-                           (["--question", "auto_peep_cmH2O=1%", "--", *SCENE], "auto_peep")):
-            run = tool(*call, *more)
+                           (["--question", "auto_peep_cmH2O=1%", "--", *SCENE], "auto_peep"),
+                           (["--question", "V_T=4%", "--", *cycled], "ends early")):
+            run = tool(air if cycled[-1] in more else "pcv", *call, *more)
             self.assertNotEqual(run.returncode, 0)
             self.assertIn(said, run.stderr)
             self.assertNotIn("Traceback", run.stderr)

@@ -24,11 +24,16 @@ MARGIN = 0.8                    # a prediction aims at so much of what is allowe
 TELLING = 0.76                  # sizes of cells that tell of their facets: of two nearer ones the difference is doubtful
 STAKE = 0.6                     # of what the budget leaves, for a run that does not promise the answer
 MOST_RUNS = 12
+# numbers that a sweep knows, and of its bars (pulmo/observers/error_bars.hpp): what richer elements see of the error in space, the bar of a
+# corrected value over its parts, the largest share that is resolved
+SWEPT = {**SHORT, "plateau_pressure_cmH2O": "P_plat", "peak_expiratory_flow_ml_per_s": "Q_exp", "work_j": "work"}
+SEEN, FACTOR, LARGEST = 0.75, 0.5, 0.1
+EARLY = "by a trigger or by cycling"  # in what a sweep says of phases whose ends jump by whole steps
 
 
 @dataclass(frozen=True)
 class Choice:
-    """A setting. size: relative size of the cells. field: errors.xdmf that they follow; mesh, refined: a file that is there."""
+    """A setting. size: of the cells, mm, or over that of a mesh from a file. field: errors.xdmf that they follow; mesh, refined: a file that is there."""
     size: float
     dt: float
     scheme: str = "beuler"
@@ -62,7 +67,7 @@ class Outcome:
 
 
 class Goal:
-    """asked: number -> share."""
+    """The search for a run whose corrected values have bars within what is asked: number -> share."""
 
     def __init__(self, asked, scene, options):
         self.asked, self.scene, self.options = asked, scene, options
@@ -244,6 +249,9 @@ class Goal:
         else:
             choice = Choice(max(o.lung or [FIRST_SIZE]), dt)
         while self.attempt(choice):
+            if any(EARLY in (self.last.parts[key]["not_resolved"] or "") for key in self.asked):
+                self.refused = "-error_estimate_method sweep has no error in time where a phase ends early; ladders may take over (--method ladder)"
+                return False
             if self.met() or len(self.outcomes) >= MOST_RUNS:
                 return True
             choice = self.next()
@@ -257,8 +265,7 @@ class Goal:
         for key, share in self.asked.items():
             texts.append(f"{'' if self.met() else 'NOT within ' + percent(share) + ': '}{self.value(key)}; {self.last.run[self.options.clock]:.3g} s "
                          f"with its sweep, {self.spent:.3g} s in all ({self.options.clock})")
-        texts += self.cost_of_a_tenth()
-        return texts
+        return texts + self.cost_of_a_tenth()
 
     def cost_of_a_tenth(self):
         """What the tenth of each share would take."""
@@ -295,6 +302,3 @@ class Goal:
         print(f"wrote {folder / 'README.md'}\n")
         return sentences
 
-
-SWEPT = {**SHORT, "plateau_pressure_cmH2O": "P_plat", "peak_expiratory_flow_ml_per_s": "Q_exp", "work_j": "work"}
-SEEN, FACTOR, LARGEST = 0.75, 0.5, 0.1  # as in pulmo/observers/error_bars.hpp; the bar of a corrected value over its parts
