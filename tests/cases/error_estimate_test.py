@@ -214,7 +214,10 @@ class SweptErrors(unittest.TestCase):
             scene = flow + ["-ventilator_tidal_volume", "30", *more, "-dm_refine", "1"]
             estimate = bars(pc.finished(scene + STEPS + SWEEP + ["-error_estimate_numbers", "PIP"]))["peak_inspiratory_pressure_cmH2O"]
             value, lacks = estimate["value"], estimate["lacks"]
-            for lack, finer in (("steps", BDF2 + ["-ts_dt", "0.0125"]), ("flow_in_space", STEPS + ["-dm_refine", "2"])):
+            finer_runs = [("steps", BDF2 + ["-ts_dt", "0.0125"])]
+            if "-tube" not in more:  # in space a tube is nothing new
+                finer_runs.append(("flow_in_space", STEPS + ["-dm_refine", "2"]))
+            for lack, finer in finer_runs:
                 error = pc.finished(scene + finer).json()["peak_inspiratory_pressure_cmH2O"] - value
                 found = lacks["steps"] + lacks["rows"] if lack == "steps" else lacks["flow_in_space"] + lacks["tissue_in_space"]
                 print(f"PIP {value:.6g}, {lack}: error {error:.4g}, found {found:.4g}", *more)
@@ -254,7 +257,7 @@ class SweptErrors(unittest.TestCase):
         scene = pc.BLOCK + pc.DIRECT + pc.QUIET + [
             "-tissue", "birzle", "-chest_wall", "-chest_wall_surfaces", "x0,y0,y1,z0,z1", "-lumen_pressure", "off", "-ventilator", "pcv",
             "-ventilator_pip", "8", "-ventilator_inspiration", "0.8", "-ventilator_expiration", "0.8", "-ventilator_ramp", "0.2",
-            "-ventilator_ramp_down", "0.2", "-ts_dt", "0.1", "-energy_audit", "off"]
+            "-ventilator_ramp_down", "0.2", "-ts_dt", "0.2", "-energy_audit", "off"]
         bar = bars(pc.finished(scene + ["-dm_refine", "1"] + SWEEP))["tidal_volume_ml"]
         error = pc.finished(scene + ["-dm_refine", "2"]).json()["tidal_volume_ml"] - bar["value"]
         self.assertEqual(bar["lacks"]["flow_in_space"], 0)
