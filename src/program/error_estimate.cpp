@@ -209,13 +209,13 @@ PetscErrorCode ErrorEstimate::choose_method(const Options &options, const Scene 
   sweeps_ = obstacle.empty();
   if (sweeps_) PetscFunctionReturn(PETSC_SUCCESS);
   PetscCall(PetscOptionsHasName(nullptr, nullptr, "-error_estimate_method", &given));
-  PulmoUserCheck(!given && names_.empty(), options.comm(),
+  PulmoUserCheck(!given, options.comm(),
                  "-error_estimate_method sweep %s; give -error_estimate_method runs, which makes more runs",
                  obstacle.c_str());
   method_ = "runs";
   if (mesh_.empty())
-    PetscCall(PetscPrintf(options.comm(), "pulmo: note: -error_estimate makes four more runs: a sweep %s\n",
-                          obstacle.c_str()));
+    PetscCall(PetscPrintf(options.comm(), "pulmo: note: -error_estimate makes four more runs%s: a sweep %s\n",
+                          names_.empty() ? "" : " and gives all numbers", obstacle.c_str()));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -184,6 +184,38 @@ class Mesh(unittest.TestCase):
         np.testing.assert_allclose(rows(place / "case/run"), whole, rtol=0, atol=1e-5 * max(v for _, v in whole))
 
 
+class Stopped(unittest.TestCase):
+    """What a stopped run was asked for beside its numbers."""
+
+    def gone_on(self, *more):
+        """Output and summary of the second call for a case whose run ended after a checkpoint, without results."""
+        place = folder()
+        made = called(os.path.join(pulmo.SOURCE, "meshes/cube_lung.msh"), "--case", "c", *QUICK, "--", "-mesh_scale", "10", "-ts_dt", "0.1",
+                      "-checkpoint_every", "1", *more, cwd=place)
+        self.assertEqual(made.returncode, 0, made.stdout + made.stderr)
+        (place / "c/run/checkpoint_previous.h5").rename(place / "c/run/checkpoint.h5")  # the last one is at the end
+        (place / "c/run/summary.json").unlink()
+        told = json.loads((place / "c/case.json").read_text())
+        told["done"]["run"]["code"] = 3
+        (place / "c/case.json").write_text(json.dumps(told))
+        again = called("c", cwd=place)
+        self.assertEqual(again.returncode, 0, again.stdout + again.stderr)
+        return again.stdout, json.loads((place / "c/run/summary.json").read_text())
+
+    def test_sensitivities(self):
+        """They need the states from the start: the run begins again."""
+        out, summary = self.gone_on("-sensitivities", "C_rs")
+        self.assertIn("begins again: -sensitivities", out)
+        self.assertIn("compliance_ml_per_cmH2O", summary["sensitivities"]["numbers"])
+
+    def test_error_bars(self):
+        """A sweep, which needs them too, gives way to more runs."""
+        out, summary = self.gone_on("-error_estimate", "-error_estimate_numbers", "C_rs")
+        self.assertIn("going on from the checkpoint", out)
+        self.assertEqual(summary["error_estimate"]["method"], "runs")
+        self.assertIn("compliance_ml_per_cmH2O", summary["error_estimate"]["numbers"])
+
+
 class Mask(unittest.TestCase):
     def test_from_two_ellipsoids_to_a_page(self):
         x = np.stack(np.meshgrid(*(np.arange(n) * 4.0 for n in (60, 40, 56)), indexing="ij"), axis=-1)

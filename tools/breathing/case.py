@@ -183,6 +183,10 @@ class Case:
         files = [f"{name}.opts" for name in (*OPTION_FILES, "accuracy") if (self.folder / f"{name}.opts").exists()]
         return ["-skip_petscrc", *(word for name in files for word in (OPTION_FILE, name)), "-dm_plex_filename", self.done["mesh"]["file"]]
 
+    def names(self, option):
+        """Whether one of the option files of this folder gives an option."""
+        return any(name == option for path in self.folder.glob("*.opts") for name, _ in read_options(path))
+
     def inputs(self, program):
         """Hashes of all that a run is made of, the program's own with them: what changes any of them makes another run."""
         files = [program, self.folder / self.done["mesh"]["file"], *sorted(self.folder.glob("*.opts")), *sorted(self.folder.glob("inputs/*"))]

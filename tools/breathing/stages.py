@@ -181,10 +181,13 @@ def run(case, given, ranks):
     script.write_text("#!/bin/sh\n# The run of this case again; pulmo must be in PATH.\ncd \"$(dirname \"$0\")\" &&\n"
                       f"exec {launcher} {shlex.join(case.options)} -output_dir again \"$@\"\n")
     script.chmod(0o755)
-    if (folder / "checkpoint.h5").exists():
+    there = (folder / "checkpoint.h5").exists()
+    if there and not case.names("-sensitivities"):
         command += ["-restart", "run/checkpoint.h5"]
         say("going on from the checkpoint")
     else:
+        if there:
+            say("the run begins again: -sensitivities needs the states from its start, which no checkpoint has")
         command.append("-output_overwrite")
     case.save(run={"inputs": inputs, "code": None, "ranks": ranks})
     code = execute(command, case)
