@@ -321,16 +321,16 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   simulation.add(unused);
   if (dry_run.in_use()) {
     PetscCall(dry_run.make(options, scene, simulation));
-    if (sensitivities.in_use())
-      PetscCall(PetscPrintf(comm,
-                            "  The sweep of -sensitivities comes on top: from half as long as the run (one number) to "
-                            "two or three times as long (all eight).\n"));
-    if (error_estimate.in_use())
-      PetscCall(PetscPrintf(comm, "  %s\n",
-                            error_estimate.sweeps()
-                                ? "The sweep of -error_estimate comes on top: from half as long as the run (one "
-                                  "number) to two or three times as long (all eight)."
-                                : "The four more runs of -error_estimate come on top, one of them with another mesh."));
+    for (const auto &[sweeps, option] :
+         {std::pair(sensitivities.in_use(), "-sensitivities"), std::pair(error_estimate.sweeps(), "-error_estimate")})
+      if (sweeps)
+        PetscCall(PetscPrintf(comm,
+                              "  The sweep of %s comes on top: from half as long as the run (one number) to two or "
+                              "three times as long (all eight).\n",
+                              option));
+    if (error_estimate.in_use() && !error_estimate.sweeps())
+      PetscCall(
+          PetscPrintf(comm, "  The four more runs of -error_estimate come on top, one of them with another mesh.\n"));
     finished = true;
     PetscFunctionReturn(PETSC_SUCCESS);
   }

@@ -108,8 +108,8 @@ public:
   /// Weights of the quadrature points, summing to 1.
   const std::vector<PetscReal> &relative_weights() const { return relative_weights_; }
   PetscInt cells() const { return layout_.cells; }
-  /// Offsets in the local vector of the dofs of cell @p c, field by field in the order of the basis.
   const CellLayout &layout() const { return layout_; }
+  /// Offsets in the local vector of the dofs of cell @p c, field by field in the order of the basis.
   const PetscInt *cell_dofs(PetscInt c) const { return layout_.cell_dofs(c); }
   const IntegrationLog &log() const { return log_; }
 

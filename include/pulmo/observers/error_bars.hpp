@@ -53,9 +53,9 @@ struct ErrorBar {
 double space_share(const ClinicalEntry &entry, const LackingParts &parts);
 
 /// The bars of @p entry from what it lacks: 1.5 times the parts, that in space more by @p largest_share, the largest
-/// space_share() of all numbers of the sweep (1 at most), by which an estimate of first order may be off; half of the
-/// bar is that of the corrected value. A part of more than a tenth of the number is no small change, and empty; that in
-/// space is empty, too, where @p largest_share is above 3.
+/// space_share() of all numbers of the sweep (1 at most), by which an estimate of first order may be off; a third of
+/// the bar is that of the corrected value. A part of more than a tenth of the number is no small change, and empty;
+/// that in space is empty, too, where @p largest_share is above 3.
 /// @p trouble_in_time: why there is no part in time; empty: there is one.
 ErrorBar lacking_bar(const ClinicalEntry &entry, const LackingParts &parts, double largest_share,
                      const std::string &trouble_in_time);
