@@ -1,6 +1,7 @@
 #include "pulmo/adjoint/functional.hpp"
 
 #include "pulmo/base/units.hpp"
+#include "pulmo/input/errors.hpp"
 #include "pulmo/observers/clinical.hpp"
 
 #include <algorithm>
@@ -264,6 +265,22 @@ std::vector<std::string> functional_names()
   std::vector<std::string> names;
   for (const Known &k : known) names.emplace_back(k.name);
   return names;
+}
+
+std::string functional_list()
+{
+  std::string list;
+  for (const Known &k : known) list += (list.empty() ? "" : ", ") + std::string(k.name);
+  return list;
+}
+
+PetscErrorCode check_functional_names(MPI_Comm comm, const char *option, const std::vector<std::string> &names)
+{
+  PetscFunctionBeginUser;
+  for (const std::string &name : names)
+    PulmoUserCheck(std::any_of(std::begin(known), std::end(known), [&](const Known &k) { return name == k.name; }),
+                   comm, "%s knows no number '%s'; give some of %s", option, name.c_str(), functional_list().c_str());
+  PetscFunctionReturn(PETSC_SUCCESS);
 }
 
 std::optional<Functional> functional(const std::string &name, const Rows &rows, const std::vector<double> &kinks)

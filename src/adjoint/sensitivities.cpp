@@ -198,28 +198,19 @@ PetscErrorCode changed_share(MPI_Comm comm, const ByCell &before, const ByCell &
 
 PetscErrorCode Sensitivities::declare(Options &options)
 {
-  std::string known;
-
   PetscFunctionBeginUser;
-  for (const std::string &name : functional_names()) known += (known.empty() ? "" : ", ") + name;
   options.group("sensitivities", "derivatives of clinical numbers by the parameters of the scene");
-  PetscCall(
-      options.names("", "after the run, one sweep back gives the derivatives of these numbers: " + known, names_));
+  PetscCall(options.names(
+      "", "after the run, one sweep back gives the derivatives of these numbers: " + functional_list(), names_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
 PetscErrorCode Sensitivities::check(const Options &options, const Scene &scene, const Model &model,
                                     const StepControl &steps, bool restarts) const
 {
-  const std::vector<std::string> known = functional_names();
-  std::string list;
-
   PetscFunctionBeginUser;
   if (!in_use()) PetscFunctionReturn(PETSC_SUCCESS);
-  for (const std::string &name : known) list += (list.empty() ? "" : ", ") + name;
-  for (const std::string &name : names_)
-    PulmoUserCheck(std::find(known.begin(), known.end(), name) != known.end(), options.comm(),
-                   "-sensitivities knows no number '%s'; give some of %s", name.c_str(), list.c_str());
+  PetscCall(check_functional_names(options.comm(), "-sensitivities", names_));
   const std::string obstacle = Sweep::obstacle(scene, model);
   PulmoUserCheck(obstacle.empty(), options.comm(), "-sensitivities %s; or leave the option out", obstacle.c_str());
   PulmoUserCheck(scene.facts().ventilator->breathes(), options.comm(),

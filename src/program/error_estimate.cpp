@@ -165,10 +165,7 @@ ErrorBar error_bar(const std::vector<ErrorLevel> &levels, std::size_t i, int ord
 
 PetscErrorCode ErrorEstimate::declare(Options &options)
 {
-  std::string known;
-
   PetscFunctionBeginUser;
-  for (const std::string &name : functional_names()) known += (known.empty() ? "" : ", ") + name;
   method_ = "sweep";
   options.group("error_estimate", "numerical error bars");
   PetscCall(options.flag("",
@@ -183,7 +180,8 @@ PetscErrorCode ErrorEstimate::declare(Options &options)
                            "one sweep back over the run, or more runs; where it is not given sweep, if the scene has "
                            "nothing that keeps a sweep from it",
                            method_));
-  PetscCall(options.names("numbers", "of a sweep: " + known + "; all that the run has where it is not given", names_));
+  PetscCall(options.names("numbers",
+                          "of a sweep: " + functional_list() + "; all that the run has where it is not given", names_));
   sweeps_ = method_ == "sweep" && mesh_.empty();
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -191,14 +189,11 @@ PetscErrorCode ErrorEstimate::declare(Options &options)
 PetscErrorCode ErrorEstimate::choose_method(const Options &options, const Scene &scene, const Model &model,
                                             bool restarts)
 {
-  const std::vector<std::string> known = functional_names();
   std::string obstacle = ErrorParts::obstacle(scene, model);
   PetscBool given;
 
   PetscFunctionBeginUser;
-  for (const std::string &name : names_)
-    PulmoUserCheck(std::find(known.begin(), known.end(), name) != known.end(), options.comm(),
-                   "-error_estimate_numbers knows no '%s'; -help lists what there is", name.c_str());
+  PetscCall(check_functional_names(options.comm(), "-error_estimate_numbers", names_));
   if (method_ != "sweep") {
     PulmoUserCheck(names_.empty(), options.comm(),
                    "-error_estimate_numbers is for -error_estimate_method sweep; more runs have all numbers");

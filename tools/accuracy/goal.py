@@ -179,8 +179,8 @@ class Goal:
         """The share that the bar of a number would have by what the last run tells."""
         part, now = self.last.parts[key], self.last.choice
         lacks, finer, shorter = part["lacks"], choice.size / now.size, choice.dt / now.dt
-        order = settings.ORDERS[choice.scheme]
-        steps = abs(lacks["steps"]) * shorter ** order * (1 if choice.scheme == now.scheme else BDF2)
+        steps = abs(lacks["steps"]) * shorter ** settings.ORDERS[choice.scheme] * (1 if choice.scheme == now.scheme else BDF2)
+        time = steps + abs(lacks["rows"]) * shorter ** ROWS
         space = (abs(lacks["flow_in_space"]) + abs(lacks["tissue_in_space"])) / SEEN * finer ** self.order_in_space(key)
         value, geometry = self.last.corrected(key), self.geometry(key)
         if math.isinf(geometry) and finer > TELLING:
@@ -188,10 +188,9 @@ class Goal:
         geometry = 0 if math.isinf(geometry) else geometry * finer ** 2
         if part["not_resolved"] and "for its phases" in part["not_resolved"] and shorter > 0.5:
             return math.inf
-        share = max((steps + abs(lacks["rows"]) * shorter ** ROWS) / abs(value), space / abs(value))
-        if share > LARGEST:
+        if max(time, space) > LARGEST * abs(value):
             return math.inf
-        error = FACTOR * (steps + abs(lacks["rows"]) * shorter ** ROWS + (1 + space / abs(value)) * space) + abs(lacks["solver"])
+        error = FACTOR * (time + (1 + space / abs(value)) * space) + abs(lacks["solver"])
         return math.hypot(error, geometry) / abs(value)
 
     def predict(self, choice):

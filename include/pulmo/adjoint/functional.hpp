@@ -26,8 +26,11 @@ struct Functional {
   std::vector<double> by_volume, by_pressure, by_flow;
 };
 
-/// Short names of the numbers that have derivatives.
+/// Short names of the numbers that have derivatives; and the same as a list for a reader.
 std::vector<std::string> functional_names();
+std::string functional_list();
+/// Refuses a name among @p names, the value of @p option, that is none of these.
+PetscErrorCode check_functional_names(MPI_Comm comm, const char *option, const std::vector<std::string> &names);
 
 /// The number with the short name @p name of a run with these signals, as overall_numbers() has it; empty if the run
 /// does not define it. @p kinks: times within phases at which curves may have one, s.
