@@ -261,6 +261,8 @@ PetscErrorCode Enrichment::add(const Sweep::Solved &stage, const std::vector<Lat
     PetscCall(VecZeroEntries(work_));
     if (field_ == displacement) {
       if (stage.by_volume[k] != 0) PetscCall(rich_.add_volume_gradient(x_, nullptr, stage.by_volume[k], work_));
+      if (const auto &part = stage.of_part[k]; part.by_volume != 0)
+        PetscCall(rich_.add_volume_gradient(x_, nullptr, part.by_volume, work_, part.cells));
       for (const Later &l : later) {
         PetscCall(interpolate(l.adjoint[k], other_));
         PetscCall(rich_.add_volume_gradient(x_, other_, l.factor, work_));

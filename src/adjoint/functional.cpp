@@ -3,6 +3,7 @@
 #include "pulmo/base/units.hpp"
 #include "pulmo/input/errors.hpp"
 #include "pulmo/observers/clinical.hpp"
+#include "pulmo/observers/regions.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -199,6 +200,7 @@ void add_fit(const Breath &b, double by_E, double by_R, Functional &f)
     f.by_pressure[b.rest] -= along;
     f.by_flow[i] += r.dt * y_Q * left - R * along;
   }
+  f.from_rest = true;
 }
 
 bool compliance(const Breath &b, Functional &f)
@@ -258,6 +260,34 @@ constexpr Known known[] = {
     {"work_j", "work", "J", work},
 };
 
+/// Of the air that a part of the lung takes in: "V_T:" and the name of a region.
+constexpr char of_a_part[] = "V_T:";
+
+/// The region that @p name is about; empty: the whole lung.
+std::string region_of(const std::string &name)
+{
+  return name.rfind(of_a_part, 0) == 0 ? name.substr(sizeof(of_a_part) - 1) : "";
+}
+
+/// RegionAudit::ventilation() of a region.
+bool ventilation(const Breath &b, const RegionAudit &regions, const std::string &region, Functional &f)
+{
+  const auto &all = regions.regions();
+  const auto found = std::find_if(all.begin(), all.end(), [&](const Mesh::Region &r) { return r.name == region; });
+  const auto index = static_cast<std::size_t>(found - all.begin());
+  if (found == all.end() || !b.numbers.takes_in) return false;
+  f.part = {region, {}};
+  for (std::size_t i = 0; i < b.rows.size(); ++i) f.part->volume.push_back(regions.state(i, index).volume_change);
+  const std::size_t fullest = end_of_inspiration(b.rows, b.first, b.last);
+  f.key = "ventilation_ml_" + region;
+  f.name = of_a_part + region;
+  f.unit = "ml";
+  f.value = f.better_value = f.part->volume[fullest] - f.part->volume[b.first];
+  f.by_volume[fullest] += 1;
+  f.by_volume[b.first] -= 1;
+  return std::abs(f.value) > rounding * size(b, &SignalRow::volume);
+}
+
 } // namespace
 
 std::vector<std::string> functional_names()
@@ -271,30 +301,51 @@ std::string functional_list()
 {
   std::string list;
   for (const Known &k : known) list += (list.empty() ? "" : ", ") + std::string(k.name);
-  return list;
+  return list + ", and " + of_a_part + "REGION for the air that a region takes in";
 }
 
-PetscErrorCode check_functional_names(MPI_Comm comm, const char *option, const std::vector<std::string> &names)
+PetscErrorCode check_functional_names(const Mesh &mesh, const char *option, const std::vector<std::string> &names)
 {
+  const MPI_Comm comm = PetscObjectComm((PetscObject)mesh.dm());
+  std::vector<Mesh::Region> regions;
+  std::string list;
+
   PetscFunctionBeginUser;
-  for (const std::string &name : names)
+  PetscCall(mesh.regions(regions));
+  for (const Mesh::Region &r : regions) list += (list.empty() ? "" : ", ") + r.name;
+  for (const std::string &name : names) {
+    const std::string region = region_of(name);
+    if (!region.empty()) {
+      PulmoUserCheck(
+          std::any_of(regions.begin(), regions.end(), [&](const Mesh::Region &r) { return r.name == region; }), comm,
+          "%s %s: the mesh has no region '%s'; %s", option, name.c_str(), region.c_str(),
+          list.empty() ? "it is one body without names" : ("it has " + list).c_str());
+      continue;
+    }
     PulmoUserCheck(std::any_of(std::begin(known), std::end(known), [&](const Known &k) { return name == k.name; }),
                    comm, "%s knows no number '%s'; give some of %s", option, name.c_str(), functional_list().c_str());
+  }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-std::optional<Functional> functional(const std::string &name, const Rows &rows, const std::vector<double> &kinks)
+std::optional<Functional> functional(const std::string &name, const Rows &rows, const std::vector<double> &kinks,
+                                     const RegionAudit *regions)
 {
   const auto breaths = complete_breaths(rows);
   const Known *k = std::find_if(std::begin(known), std::end(known), [&](const Known &one) { return name == one.name; });
-  if (k == std::end(known) || breaths.empty()) return {};
+  const std::string region = region_of(name);
+  if (breaths.empty() || (region.empty() ? k == std::end(known) : !regions)) return {};
   Functional f;
-  f.key = k->key;
-  f.name = k->name;
-  f.unit = k->unit;
   for (auto *gradient : {&f.by_volume, &f.by_pressure, &f.by_flow}) gradient->assign(rows.size(), 0);
   const Breath breath{rows, breaths.front().first, breaths.back().first, breaths.back().last, overall_numbers(rows),
                       kinks};
+  if (!region.empty()) {
+    if (!ventilation(breath, *regions, region, f)) return {};
+    return f;
+  }
+  f.key = k->key;
+  f.name = k->name;
+  f.unit = k->unit;
   if (!k->make(breath, f)) return {};
   return f;
 }

@@ -202,6 +202,10 @@ PetscErrorCode Sensitivities::declare(Options &options)
   options.group("sensitivities", "derivatives of clinical numbers by the parameters of the scene");
   PetscCall(options.names(
       "", "after the run, one sweep back gives the derivatives of these numbers: " + functional_list(), names_));
+  PetscCall(options.flag("fields",
+                         "write the derivatives by a value that changes in one cell alone to sensitivities.xdmf, a "
+                         "field for each number and parameter of the tissue",
+                         fields_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -209,8 +213,9 @@ PetscErrorCode Sensitivities::check(const Options &options, const Scene &scene, 
                                     const StepControl &steps, bool restarts) const
 {
   PetscFunctionBeginUser;
+  PulmoUserCheck(in_use() || !fields_, options.comm(), "-sensitivities_fields has no effect without -sensitivities");
   if (!in_use()) PetscFunctionReturn(PETSC_SUCCESS);
-  PetscCall(check_functional_names(options.comm(), "-sensitivities", names_));
+  PetscCall(check_functional_names(scene.mesh(), "-sensitivities", names_));
   const std::string obstacle = Sweep::obstacle(scene, model);
   PulmoUserCheck(obstacle.empty(), options.comm(), "-sensitivities %s; or leave the option out", obstacle.c_str());
   PulmoUserCheck(scene.facts().ventilator->breathes(), options.comm(),
@@ -246,7 +251,7 @@ PetscErrorCode add_derivatives(const Options &options, const Scene &scene, Model
   for (const Functional &f : functionals) report.numbers.push_back({f.key, f.name, f.unit, f.value});
   for (const Parameter &p : parameters)
     report.parameters.push_back(
-        {p.option.option, p.option.unit, *p.option.target, p.varies, std::vector<double>(count, 0), {}});
+        {p.option.option, p.option.unit, *p.option.target, p.varies, std::vector<double>(count, 0), {}, {}});
   std::vector<ByCell> by_cell(
       parameters.size(), ByCell(count, std::vector<PetscReal>(static_cast<std::size_t>(model.assembly().cells()), 0)));
   // by the parameters of kernels; @p residual: what they act in, times the multipliers
@@ -318,6 +323,7 @@ PetscErrorCode add_derivatives(const Options &options, const Scene &scene, Model
       PetscCall(sum_up(options.comm(), sums));
       row.by_region.emplace_back(region.name, sums);
     }
+    if (!parameters[i].places.empty()) row.by_cell = std::move(by_cell[i]);
   }
   for (std::size_t i = parameters.size(); i-- > 0;) {
     if (parameters[i].places.empty() || parameters[i].effect == 0 || parameters[i].effect >= hidden) continue;
@@ -329,9 +335,18 @@ PetscErrorCode add_derivatives(const Options &options, const Scene &scene, Model
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+std::vector<std::pair<std::string, std::vector<double>>> Sensitivities::fields(const SensitivityReport &report) const
+{
+  std::vector<std::pair<std::string, std::vector<double>>> list;
+  for (std::size_t k = 0; fields_ && k < report.numbers.size(); ++k)
+    for (const SensitivityReport::Parameter &p : report.parameters)
+      if (!p.by_cell.empty()) list.emplace_back(report.numbers[k].key + "_by_" + p.option.substr(1), p.by_cell[k]);
+  return list;
+}
+
 PetscErrorCode Sensitivities::make(const Options &options, const Scene &scene, Model &model, Simulation &simulation,
                                    const Recording &recording, const std::vector<SignalRow> &rows,
-                                   SensitivityReport &report)
+                                   const RegionAudit *regions, SensitivityReport &report)
 {
   const MPI_Comm comm = options.comm();
   Sweep sweep(scene, model, simulation, recording.trajectory());
@@ -343,7 +358,7 @@ PetscErrorCode Sensitivities::make(const Options &options, const Scene &scene, M
   PetscCall(recording.complaint(comm, report.failure));
   if (!report.failure.empty()) PetscFunctionReturn(PETSC_SUCCESS);
   for (const std::string &name : names_) {
-    const auto f = functional(name, rows);
+    const auto f = functional(name, rows, {}, regions);
     if (f)
       functionals.push_back(*f);
     else

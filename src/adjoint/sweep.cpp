@@ -42,9 +42,10 @@ PetscErrorCode Sweep::create(VecHandle &local) const
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Sweep::setup()
+PetscErrorCode Sweep::setup(const std::vector<Functional> &functionals)
 {
   PetscInt fields;
+  std::vector<Mesh::Region> regions;
 
   PetscFunctionBeginUser;
   if (model_.composition().memory_acts()) memory_ = std::make_unique<MemorySweep>(model_);
@@ -52,6 +53,12 @@ PetscErrorCode Sweep::setup()
   gas_ = fields > pressure;
   for (VecHandle *v : {&x_, &rate_, &past_, &column_, &border_, &work_, &other_}) PetscCall(create(*v));
   for (VecHandle *v : {&right_, &held_, &product_, &residual_}) PetscCall(DMCreateGlobalVector(model_.dm(), v->out()));
+  count_ = functionals.size();
+  parts_.assign(count_, {});
+  PetscCall(scene_.mesh().regions(regions));
+  for (std::size_t k = 0; k < count_; ++k)
+    for (const Mesh::Region &region : regions)
+      if (functionals[k].part && functionals[k].part->region == region.name) parts_[k] = region.cells;
   volumes_.assign(trajectory_.stages().size(), 0);
   flows_ = volumes_;
   for (std::size_t i = 0; i < volumes_.size(); ++i) {
@@ -235,7 +242,7 @@ PetscErrorCode Sweep::look_back(const StageRecord &record, Vec z, std::size_t fu
     if (gas_ && record.stage.multistep) PetscCall(model_.add_volume_gradient(x_, z, -scale, other_));
   }
   for (int i = 0; i < 2; ++i) {
-    if (record.past[i] <= 0) continue; // at rest at the start
+    if (record.past[i] < 0) continue;
     Wanted &before = wanted(pending, record.past[i], functional);
     if (!before.state) PetscCall(create(before.state));
     if (*other_rates_) PetscCall(VecAXPY(before.state, record.weight[i], other_));
@@ -263,7 +270,7 @@ PetscErrorCode Sweep::want_by_memory(const StageRecord &record, std::vector<Want
     if (want[k].memory.empty()) continue;
     want[k].pressure += numbers[k].by_pressure;
     for (int i = 0; i < 2; ++i) {
-      if (record.past[i] <= 0) continue; // at rest at the start
+      if (record.past[i] < 0) continue;
       Wanted &before = wanted(pending, record.past[i], k);
       if (!before.state) PetscCall(create(before.state));
       PetscCall(VecAXPY(before.state, record.weight[i], by_rate[k]));
@@ -317,6 +324,40 @@ PetscErrorCode Sweep::weighted_start(bool facets, std::vector<std::vector<PetscR
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode Sweep::make_shifts(PetscInt stage, const Pending &pending)
+{
+  const auto found = pending.find(stage);
+
+  PetscFunctionBeginUser;
+  for (Shift *shift : shifts_) {
+    if (shift->stage != stage) continue;
+    shift->change.assign(count_, 0);
+    if (found == pending.end()) continue;
+    const auto of = [&](PetscInt n) -> const StageRecord & {
+      return trajectory_.stages()[static_cast<std::size_t>(n)];
+    };
+    const auto from = static_cast<std::size_t>(shift->from), to = static_cast<std::size_t>(shift->to);
+    MemorySweep::Values before, after;
+    PetscCall(trajectory_.state(shift->from, past_));
+    PetscCall(trajectory_.state(shift->to, other_));
+    PetscCall(VecAXPY(other_, -1, past_));
+    if (memory_) {
+      PetscCall(trajectory_.remembered(shift->from, before));
+      PetscCall(trajectory_.remembered(shift->to, after));
+    }
+    for (std::size_t k = 0; k < count_; ++k) {
+      const Wanted &w = found->second[k];
+      PetscReal by_state = 0, sum = 0;
+      if (w.state) PetscCall(VecDot(w.state, other_, &by_state));
+      for (std::size_t i = 0; i < w.memory.size(); ++i) by_state += w.memory[i] * (after[i] - before[i]);
+      PetscCallMPI(MPI_Allreduce(&by_state, &sum, 1, MPIU_REAL, MPI_SUM, PetscObjectComm((PetscObject)model_.dm())));
+      shift->change[k] = sum + w.volume * (volumes_[to] - volumes_[from]) + w.flow * (flows_[to] - flows_[from]) +
+                         w.pressure * (of(shift->to).airway.pressure - of(shift->from).airway.pressure);
+    }
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 /// Adds what the numbers want of the row that a stage ends.
 void Sweep::want_row(const std::vector<Functional> &functionals, PetscInt stage, Pending &pending) const
 {
@@ -327,7 +368,7 @@ void Sweep::want_row(const std::vector<Functional> &functionals, PetscInt stage,
     const Functional &f = functionals[k];
     if (f.by_volume[row] == 0 && f.by_pressure[row] == 0 && f.by_flow[row] == 0) continue;
     Wanted &w = wanted(pending, stage, k);
-    w.volume += f.by_volume[row] / units::mm3_per_ml;
+    (f.part ? w.part : w.volume) += f.by_volume[row] / units::mm3_per_ml;
     w.flow += f.by_flow[row] / units::mm3_per_ml;
     want_ventilator_pressure(stage, f.by_pressure[row] / units::kPa_per_cmH2O, w);
   }
@@ -373,6 +414,7 @@ PetscErrorCode Sweep::right_side(const StageRecord &record, std::size_t k, Wante
   PetscCall(VecZeroEntries(work_));
   if (w.state) PetscCall(VecCopy(w.state, work_));
   if (w.volume != 0) PetscCall(model_.add_volume_gradient(x_, nullptr, w.volume, work_));
+  if (w.part != 0) PetscCall(model_.add_volume_gradient(x_, nullptr, w.part, work_, &parts_[k]));
   if (free) PetscCall(model_.airway().add_mean_gradient(w.pressure, work_));
   PetscCall(to_global(work_, right));
   if (gas_ && !free && w.flow != 0) {
@@ -493,9 +535,8 @@ PetscErrorCode Sweep::run(const std::vector<Functional> &functionals, PetscReal 
   std::vector<VecHandle> adjoint(functionals.size()), rights(functionals.size());
 
   PetscFunctionBeginUser;
-  count_ = functionals.size();
   tolerance_ = tolerance;
-  PetscCall(setup());
+  PetscCall(setup(functionals));
   for (VecHandle &z : adjoint) PetscCall(create(z));
   for (VecHandle &right : rights) PetscCall(VecDuplicate(right_, right.out()));
   PetscCall(TSGetSNES(simulation_.ts(), &snes));
@@ -506,6 +547,7 @@ PetscErrorCode Sweep::run(const std::vector<Functional> &functionals, PetscReal 
   for (auto n = static_cast<PetscInt>(stages.size()) - 1; n > 0 && failure.empty() && !stopped_; --n) {
     if (stop_request_) PetscCall(stop_request_->asked(stopped_));
     const StageRecord &record = stages[static_cast<std::size_t>(n)];
+    PetscCall(make_shifts(n, pending));
     want_row(functionals, n, pending);
     const auto found = pending.find(n);
     if (found == pending.end()) continue; // nothing depends on it
@@ -521,10 +563,11 @@ PetscErrorCode Sweep::run(const std::vector<Functional> &functionals, PetscReal 
       PetscCall(solve_border(c, failure));
     }
     const std::vector<PetscReal> none(count_, 0);
-    Solved result{n, record, x_, rate_, {}, none, none, none, none, none, {}};
+    Solved result{n, record, x_, rate_, {}, none, none, none, none, none, {}, {}};
     for (std::size_t k = 0; k < count_; ++k) {
       result.adjoint.push_back(adjoint[k]);
       result.by_memory.push_back(want[k].weights());
+      result.of_part.push_back({functionals[k].part ? &parts_[k] : nullptr, want[k].part});
     }
     for (std::size_t k = 0; k < count_; ++k) {
       if (want[k].nothing()) // no later row of this number
@@ -535,6 +578,7 @@ PetscErrorCode Sweep::run(const std::vector<Functional> &functionals, PetscReal 
     if (memory_ && failure.empty()) PetscCall(look_back_at_memory(result, pending));
     if (visit && failure.empty()) PetscCall(visit(result));
   }
+  PetscCall(make_shifts(0, pending));
   start_ = std::move(pending[0]);
   PetscCall(KSPSetTolerances(ksp_, relative, absolute, PETSC_DEFAULT, PETSC_DEFAULT));
   PetscFunctionReturn(PETSC_SUCCESS);

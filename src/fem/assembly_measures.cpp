@@ -182,7 +182,8 @@ PetscErrorCode Assembly::weighted_volume(Vec x, const std::vector<Vec> &weights,
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Assembly::add_volume_gradient(Vec x, Vec weight, PetscReal factor, Vec y)
+PetscErrorCode Assembly::add_volume_gradient(Vec x, Vec weight, PetscReal factor, Vec y,
+                                             const std::vector<PetscInt> *cells)
 {
   const element::ScalarBasis basis = watched_.basis();
 
@@ -190,8 +191,10 @@ PetscErrorCode Assembly::add_volume_gradient(Vec x, Vec weight, PetscReal factor
   if (weight) PetscCall(prepare_weighing());
   const ReadArray xs(x), qs(weight ? weight : x);
   WriteArray ys(y);
-  for (PetscInt c = 0; c < layout_.cells; ++c) {
-    const PetscInt *dofs = cell_dofs(c), *mass_dofs = dofs + 3 * basis.nodes;
+  const PetscInt count = cells ? static_cast<PetscInt>(cells->size()) : layout_.cells;
+  for (PetscInt n = 0; n < count; ++n) {
+    const PetscInt c = cells ? (*cells)[static_cast<std::size_t>(n)] : n, *dofs = cell_dofs(c),
+                   *mass_dofs = dofs + 3 * basis.nodes;
     const PetscReal *inverse = &invJ_[9 * c];
     const CellDisplacement u(watched_, inverse, dofs, xs.data());
     Vector4 sum[max_nodes] = {};

@@ -606,7 +606,10 @@ PetscErrorCode FieldWriter::write_cells(const std::string &name,
   if (!mesh_written_) PetscCall(write_mesh());
   Xdmf f(n_cells_, n_nodes_);
   f.begin(name, mesh_, {});
-  for (const auto &[field, cells] : values) {
+  for (const auto &[given, cells] : values) {
+    std::string field = given; // a region's name may hold what a path in the file may not
+    std::replace_if(
+        field.begin(), field.end(), [](char c) { return c == '/' || c == ':'; }, '_');
     PetscCall(file.write(field, 1, cells));
     f.of_cells(field, name + ".h5");
   }

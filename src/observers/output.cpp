@@ -117,7 +117,7 @@ PetscErrorCode Output::prepare(const Options &options, const std::string &restar
     std::error_code error;
     std::vector<fs::path> old;
     for (const char *name : {"scene.json", "summary.json", "failure.json", "signals.csv", "energy.csv", "fields.xdmf",
-                             "errors.xdmf", "errors.h5"})
+                             "errors.xdmf", "errors.h5", "sensitivities.xdmf", "sensitivities.h5"})
       old.push_back(path(name));
     if (!continues) // else they are replaced whole
       for (const char *name : {"signals.csv.part", "checkpoint.h5", "checkpoint_previous.h5", "checkpoint.h5.part"})

@@ -181,6 +181,10 @@ Json errors_json(const ErrorReport &report)
                        {"flow_in_space", bar.lacks->flow_in_space},
                        {"tissue_in_space", bar.lacks->tissue_in_space},
                        {"solver", bar.lacks->solver}};
+    number["more_breaths"] = nullptr;
+    if (bar.more_breaths)
+      number["more_breaths"] = {{"next", bar.more_breaths->next},
+                                {"periodic", optional_json(bar.more_breaths->periodic)}};
   }
   json["runs"] = Json::array();
   for (const ErrorLevel &level : report.levels) {

@@ -1,11 +1,13 @@
 #include "pulmo/program/error_estimate.hpp"
 
 #include "pulmo/adjoint/error_parts.hpp"
+#include "pulmo/adjoint/periodicity.hpp"
 #include "pulmo/adjoint/recording.hpp"
 
 #include "pulmo/base/units.hpp"
 #include "pulmo/mesh/read_mesh.hpp"
 #include "pulmo/observers/output.hpp"
+#include "pulmo/observers/regions.hpp"
 #include "pulmo/program/other_run.hpp"
 #include "pulmo/pulmo.hpp"
 
@@ -193,7 +195,7 @@ PetscErrorCode ErrorEstimate::choose_method(const Options &options, const Scene 
   PetscBool given;
 
   PetscFunctionBeginUser;
-  PetscCall(check_functional_names(options.comm(), "-error_estimate_numbers", names_));
+  PetscCall(check_functional_names(scene.mesh(), "-error_estimate_numbers", names_));
   if (method_ != "sweep") {
     PulmoUserCheck(names_.empty(), options.comm(),
                    "-error_estimate_numbers is for -error_estimate_method sweep; more runs have all numbers");
@@ -378,13 +380,14 @@ PetscErrorCode ErrorEstimate::make(const Options &options, const Output &output,
 
 PetscErrorCode ErrorEstimate::make_by_sweep(const Options &options, const Scene &scene, Model &model,
                                             Simulation &simulation, const Recording &recording,
-                                            const std::vector<SignalRow> &rows,
-                                            const std::vector<ClinicalEntry> &numbers, FieldWriter &fields,
-                                            ErrorReport &report) const
+                                            const RegionAudit &regions, FieldWriter &fields, ErrorReport &report) const
 {
   const MPI_Comm comm = options.comm();
   Sweep sweep(scene, model, simulation, recording.trajectory());
   ErrorParts parts(scene, model, simulation, recording.trajectory());
+  const std::vector<SignalRow> rows = regions.complete(simulation.rows());
+  const std::vector<ClinicalEntry> numbers = regions.numbers(simulation.rows());
+  Periodicity periodicity(scene, rows, recording.trajectory());
   std::vector<Functional> functionals;
   std::vector<std::pair<std::string, std::vector<PetscReal>>> in_space;
   PetscLogDouble begin, end;
@@ -400,7 +403,7 @@ PetscErrorCode ErrorEstimate::make_by_sweep(const Options &options, const Scene 
   PetscCall(recording.complaint(comm, report.failure));
   if (!report.failure.empty()) PetscFunctionReturn(PETSC_SUCCESS);
   for (const std::string &name : names_.empty() ? functional_names() : names_) {
-    const auto f = functional(name, rows, parts.kinks());
+    const auto f = functional(name, rows, parts.kinks(), &regions);
     if (f)
       functionals.push_back(*f);
     else if (!names_.empty())
@@ -417,6 +420,7 @@ PetscErrorCode ErrorEstimate::make_by_sweep(const Options &options, const Scene 
   }
   StopSignal signal(comm);
   sweep.heed(signal);
+  periodicity.ask(sweep);
   PetscCall(PetscPrintf(comm, "\nError estimate: a sweep back over %d steps\n",
                         static_cast<int>(simulation.rows().size()) - 1));
   PetscCall(parts.run(sweep, functionals, recording.tolerance(), report.failure));
@@ -427,19 +431,25 @@ PetscErrorCode ErrorEstimate::make_by_sweep(const Options &options, const Scene 
   std::vector<ClinicalEntry> entries;
   double largest_share = 0;
   for (std::size_t k = 0; k < functionals.size(); ++k) {
-    const auto entry = std::find_if(numbers.begin(), numbers.end(),
-                                    [&](const ClinicalEntry &e) { return functionals[k].key == e.key; });
-    PetscCheck(entry != numbers.end() && entry->value, PETSC_COMM_SELF, PETSC_ERR_PLIB, "no clinical number %s",
-               functionals[k].key.c_str());
-    entries.push_back(*entry);
-    largest_share = std::max(largest_share, space_share(*entry, parts.lacking()[k]));
-    if (k < asked) in_space.emplace_back("lacks_in_space_" + functionals[k].key, parts.in_space()[k]);
+    const Functional &f = functionals[k];
+    const auto entry =
+        std::find_if(numbers.begin(), numbers.end(), [&](const ClinicalEntry &e) { return f.key == e.key; });
+    if (f.part) {
+      entries.push_back({f.key, "ventilation of " + f.part->region, f.unit, f.value});
+    } else {
+      PetscCheck(entry != numbers.end() && entry->value, PETSC_COMM_SELF, PETSC_ERR_PLIB, "no clinical number %s",
+                 f.key.c_str());
+      entries.push_back(*entry);
+    }
+    largest_share = std::max(largest_share, space_share(entries.back(), parts.lacking()[k]));
+    if (k < asked) in_space.emplace_back("lacks_in_space_" + f.key, parts.in_space()[k]);
   }
   const bool early = ended_early(scene, simulation.rows());
   for (std::size_t k = 0; k < asked; ++k) {
     const bool resolved = functionals[k].resolved && parts.rough_in_time(k) <= guessed * std::abs(*entries[k].value);
     const std::string trouble = early ? ends_with_a_step : resolved ? "" : "steps too long for its phases";
     report.bars.push_back(lacking_bar(entries[k], parts.lacking()[k], largest_share, trouble));
+    report.bars.back().more_breaths = periodicity.change(functionals[k], k);
   }
   PetscCall(fields.write_cells("errors", in_space));
   PetscCall(PetscTime(&end));

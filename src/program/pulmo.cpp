@@ -379,7 +379,10 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
     else if (complete_breaths(rows).empty())
       sensitivity_report.failure = why_no_numbers(scene, rows);
     else
-      PetscCall(sensitivities.make(options, scene, run.model(), simulation, recording, rows, sensitivity_report));
+      PetscCall(
+          sensitivities.make(options, scene, run.model(), simulation, recording, rows, &regions, sensitivity_report));
+    const auto by_cell = sensitivities.fields(sensitivity_report);
+    if (!by_cell.empty()) PetscCall(fields.write_cells("sensitivities", by_cell));
     audits.sensitivities = &sensitivity_report;
     PetscCall(write_summary(options, output, scene, run.model(), simulation, audits, true));
     PetscCall(print_sensitivities(comm, sensitivity_report, simulation.seconds().total));
@@ -389,12 +392,11 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
                           asked_to_stop ? "the run was asked to stop" : why_no_numbers(scene, rows).c_str()));
   } else if (error_estimate.in_use()) {
     ErrorReport report;
-    const std::vector<ClinicalEntry> numbers = regions.numbers(simulation.rows());
     if (error_estimate.sweeps())
-      PetscCall(error_estimate.make_by_sweep(options, scene, run.model(), simulation, recording, rows, numbers, fields,
-                                             report));
+      PetscCall(
+          error_estimate.make_by_sweep(options, scene, run.model(), simulation, recording, regions, fields, report));
     else
-      PetscCall(error_estimate.make(options, output, scene, simulation, numbers, report));
+      PetscCall(error_estimate.make(options, output, scene, simulation, regions.numbers(simulation.rows()), report));
     audits.errors = &report;
     PetscCall(write_summary(options, output, scene, run.model(), simulation, audits, true));
     PetscCall(print_error_bars(comm, report));

@@ -265,6 +265,54 @@ class SweptErrors(unittest.TestCase):
         self.assertGreater(bar["lacks"]["tissue_in_space"] / error, 0.4)
         self.assertLess(bar["lacks"]["tissue_in_space"] / error, 2)
 
+    def test_more_breaths(self):
+        """Breaths that trap gas: what one more breath changes, exact where all is linear, and the limit, against runs of more."""
+        short = SCENE + ["-airflow_permeability", "30", "-ventilator_expiration", "0.3", "-ts_dt", "0.1"]
+        for pip, share in (("0.01", 1e-3), ("8", 0.1)):
+            scene = short + ["-ventilator_pip", pip, "-ventilator_breaths"]
+            many = pc.finished(scene + ["12"]).json()
+            for breaths in (1, 3):
+                run, following = pc.finished(scene + [str(breaths)] + SWEEP), pc.finished(scene + [str(breaths + 1)]).json()
+                for key in ("tidal_volume_ml", "peak_expiratory_flow_ml_per_s", "work_j"):
+                    bar = bars(run)[key]
+                    change, told = following[key] - bar["value"], bar["more_breaths"]
+                    self.assertAlmostEqual(told["next"], change, delta=share * abs(change), msg=f"{key}, {pip} cmH2O, {breaths}")
+                    self.assertEqual(told["periodic"] is None, breaths == 1, "one breath does not tell")
+                    if breaths == 3:
+                        left = many[key] - bar["value"]
+                        self.assertAlmostEqual(told["periodic"], left, delta=0.3 * abs(left), msg=key)
+                self.assertIn("Breaths are not periodic yet", run.out)
+        two = pc.finished(scene + ["2"] + SWEEP, ranks=2)  # the same on any number of ranks
+        for key, bar in bars(pc.finished(scene + ["2"] + SWEEP)).items():
+            self.assertAlmostEqual(bars(two)[key]["more_breaths"]["next"], bar["more_breaths"]["next"], delta=1e-6 * abs(bar["value"]), msg=key)
+        settled = pc.finished(SCENE + STEPS + ["-airflow_permeability", "1e5", "-ventilator_breaths", "2"] + SWEEP)
+        self.assertNotIn("not periodic", settled.out)
+        self.assertLess(abs(bars(settled)["tidal_volume_ml"]["more_breaths"]["periodic"]), 1e-4)
+
+    def test_a_breath_that_differs(self):
+        """The last breath of a programme is a larger one: nothing to repeat."""
+        breath = "inspiration 0.4 pressure {} ramp 0.2\nexpiration 0.4 pressure 0 ramp 0.2\n"
+        scene = SCENE[:SCENE.index("-ventilator")] + ["-energy_audit", "off"]
+        for last, told in ((8, True), (10, False)):
+            case = pc.finished(scene + pc.programme(breath.format(8) + breath.format(last)) + ["-ts_dt", "0.1"] + SWEEP)
+            self.assertEqual(bars(case)["tidal_volume_ml"]["more_breaths"] is not None, told)
+
+    def test_parts_of_the_lung(self):
+        """The air of each lung, as regions have it, with bars of its own: what both lack is what the whole lacks."""
+        names = ["-error_estimate_numbers", "V_T,V_T:right_lung,V_T:left_lung"]
+        case = pc.finished(pc.DIRECT + pc.options_file("scenes/pcv.opts") + pc.QUIET + [
+            "-dm_plex_filename", pc.mesh("lung_pair.msh"), "-elements", "P1-P1", "-ts_dt", "0.2", "-ventilator_inspiration", "0.4",
+            "-ventilator_expiration", "0.4", "-ventilator_ramp", "0.2", "-ventilator_ramp_down", "0.2", "-energy_audit", "off"] + SWEEP + names)
+        whole, *lungs = (bars(case)[key] for key in ("tidal_volume_ml", "ventilation_ml_right_lung", "ventilation_ml_left_lung"))
+        for lung, name in zip(lungs, ("right_lung", "left_lung")):
+            self.assertAlmostEqual(lung["value"], case.json()["regions"][name]["ventilation_ml"], delta=1e-9 * lung["value"])
+        for part in ("steps", "flow_in_space", "tissue_in_space"):
+            parts = [lung["lacks"][part] for lung in lungs]
+            self.assertAlmostEqual(sum(parts), whole["lacks"][part], delta=1e-5 * max(map(abs, parts)), msg=part)
+        bad = pc.Case(SCENE + SWEEP + ["-error_estimate_numbers", "V_T:upper_lobe"])
+        self.assertNotEqual(bad.code, 0)
+        self.assertIn("-error_estimate_numbers V_T:upper_lobe: the mesh has no region 'upper_lobe'", bad.err)
+
     def test_chosen_where_it_holds(self):
         case = pc.finished(SCENE + STEPS + ["-error_estimate", "-error_estimate_numbers", "C_rs"])
         self.assertEqual(list(bars(case)), ["compliance_ml_per_cmH2O"])

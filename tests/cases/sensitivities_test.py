@@ -20,7 +20,7 @@ ASK = ["-sensitivities", "C_rs,R,PIP,V_T", "-sweep_rtol", "1e-12"]
 
 def table(case, column="derivative"):
     """{number: {option: derivative}}"""
-    return {key: {option: one[column] for option, one in given["parameters"].items()}
+    return {key: {option: one.get(column) for option, one in given["parameters"].items()}
             for key, given in case.json()["sensitivities"]["numbers"].items()}
 
 
@@ -104,14 +104,39 @@ class Sensitivities(unittest.TestCase):
                   "-ventilator_expiration", "0.4", "-ventilator_ramp", "0.2", "-ventilator_ramp_down", "0.2", "-energy_audit", "off"])
         for given in (0.35, 0.5):
             with self.subTest(right_lung=given):
-                run = pc.finished(scene + ["-tissue_c", f"0.35,right_lung={given}" if given != 0.35 else "0.35"] + ASK, ranks=2)
+                run = pc.finished(scene + ["-tissue_c", f"0.35,right_lung={given}" if given != 0.35 else "0.35", "-sensitivities_fields",
+                                           "-sensitivities", "C_rs,V_T,V_T:right_lung,V_T:left_lung", *ASK[2:]], ranks=2)
+                self.by_cell(run)
+                self.of_the_parts(run)
                 one = run.json()["sensitivities"]["numbers"]["compliance_ml_per_cmH2O"]["parameters"]["-tissue_c"]
                 self.assertEqual(one["percent_for_one_percent_more"] is None, given != 0.35)
                 self.assertAlmostEqual(sum(one["regions"].values()), one["derivative"], delta=1e-9 * abs(one["derivative"]))
-                moved = [pc.finished(scene + ["-tissue_c", f"0.35,right_lung={given + s}"]).json()["compliance_ml_per_cmH2O"]
-                         for s in (-1e-3, 1e-3)]
-                self.assertAlmostEqual((moved[1] - moved[0]) / 2e-3, one["regions"]["right_lung"], delta=1e-5 * abs(one["derivative"]))
+                moved = [pc.finished(scene + ["-tissue_c", f"0.35,right_lung={given + s}"]).json() for s in (-1e-3, 1e-3)]
+                compliance = [m["compliance_ml_per_cmH2O"] for m in moved]
+                self.assertAlmostEqual((compliance[1] - compliance[0]) / 2e-3, one["regions"]["right_lung"], delta=1e-5 * abs(one["derivative"]))
                 self.assertLess(one["regions"]["right_lung"], -1)
+                for lung in ("right_lung", "left_lung"):
+                    air = [m["regions"][lung]["ventilation_ml"] for m in moved]
+                    swept = table(run, "regions")["ventilation_ml_" + lung]["-tissue_c"]["right_lung"]
+                    self.assertAlmostEqual((air[1] - air[0]) / 2e-3, swept, delta=1e-5 * abs(one["regions"]["right_lung"]), msg=lung)
+
+    def by_cell(self, run):
+        """Derivatives by the value of one cell add up to that of all, and to those of regions."""
+        import h5py
+
+        with h5py.File(run.path("sensitivities.h5")) as file:
+            for key, derivatives in table(run).items():
+                for option, whole in derivatives.items():
+                    if not option.startswith("-ventilator"):
+                        cells = file[f"{key}_by_{option[1:]}"][()]
+                        self.assertAlmostEqual(cells.sum(), whole, delta=1e-9 * abs(cells).sum(), msg=key + option)
+
+    def of_the_parts(self, run):
+        """What the lungs take in is what both do."""
+        by = table(run)
+        for option, whole in by["tidal_volume_ml"].items():
+            parts = [by["ventilation_ml_" + lung][option] for lung in ("right_lung", "left_lung")]
+            self.assertAlmostEqual(sum(parts), whole, delta=1e-7 * max(map(abs, parts)), msg=option)
 
     def test_parameters_of_small_effect(self):
         """A step of 1e-7 of such a value would be lost in the residual: bigger ones are taken, and what rounding hides is left out."""

@@ -46,7 +46,7 @@ PetscErrorCode run_scene(const std::string &options, bool sweeps, Swept &result)
   result.rejected = run.simulation().rejected_steps();
   if (sweeps)
     PetscCall(sensitivities.make(run.options(), run.scene(), run.model(), run.simulation(), recording, result.rows,
-                                 result.report));
+                                 nullptr, result.report));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -489,7 +489,7 @@ TEST(StatesInAFile, ThatCannotBeWrittenEndNoRun)
   PULMO_OK(run.simulation().run(finished));
   EXPECT_TRUE(finished);
   PULMO_OK(sensitivities.make(run.options(), run.scene(), run.model(), run.simulation(), recording,
-                              run.simulation().rows(), report));
+                              run.simulation().rows(), nullptr, report));
   EXPECT_NE(report.failure.find("did not fit into /none/of/these"), std::string::npos) << report.failure;
   EXPECT_NE(report.failure.find("-sweep_memory"), std::string::npos) << report.failure;
   EXPECT_TRUE(report.numbers.empty());

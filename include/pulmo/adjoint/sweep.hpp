@@ -42,6 +42,12 @@ public:
     /// multiplier of the opening's equation in place, which stands in @p opening.
     std::vector<PetscReal> by_volume, by_mean_pressure, opening;
     std::vector<PetscReal> by_flow; ///< [functional]: of the gas of this stage through the opening, s/mm^3
+    /// What the number itself wants of the volume of a part of the lung.
+    struct OfPart {
+      const std::vector<PetscInt> *cells = nullptr; ///< of this rank; null: it is of the whole lung
+      PetscReal by_volume = 0;                      ///< 1/mm^3
+    };
+    std::vector<OfPart> of_part;                        ///< [functional]
     std::vector<const MemorySweep::Values *> by_memory; ///< [functional]: l; null: none
   };
   using Visit = std::function<PetscErrorCode(const Solved &)>;
@@ -64,6 +70,14 @@ public:
   /// What is remembered there at the start times its multipliers, in the same way.
   PetscErrorCode weighted_start(bool facets, std::vector<std::vector<PetscReal>> &sums);
 
+  /// The state of @p stage moved by what separates the states of two others, and what that makes of the numbers.
+  struct Shift {
+    PetscInt stage, from, to;
+    std::vector<PetscReal> change; ///< [functional]: to first order, through later stages alone
+  };
+  /// Asks for Shift::change of @p shift, which must outlive the sweep.
+  void ask_shift(Shift &shift) { shifts_.push_back(&shift); }
+
   /// Lets @p request end the sweep after the stage at hand; stopped() tells that it did. It must outlive the sweep.
   void heed(StopRequest &request) { stop_request_ = &request; }
   bool stopped() const { return stopped_; }
@@ -80,8 +94,9 @@ private:
   struct Wanted {
     VecHandle state;                              ///< local, to be summed over the ranks; null: nothing
     PetscReal volume = 0, pressure = 0, flow = 0; ///< per mm^3, kPa (at the opening), mm^3/s
+    PetscReal part = 0;                           ///< per mm^3 of the part that the number is of
     MemorySweep::Values memory;                   ///< by what is remembered; empty: nothing
-    bool nothing() const { return !state && volume == 0 && pressure == 0 && flow == 0 && memory.empty(); }
+    bool nothing() const { return !state && volume == 0 && pressure == 0 && flow == 0 && part == 0 && memory.empty(); }
     const MemorySweep::Values *weights() const { return memory.empty() ? nullptr : &memory; }
   };
   using Pending = std::map<PetscInt, std::vector<Wanted>>;
@@ -91,9 +106,11 @@ private:
     PetscReal by_pressure = 0, by_volume = 0, by_flow = 0, by_target = 0; ///< by_flow: of the gas, through pasts, too
   };
 
-  PetscErrorCode setup();
+  PetscErrorCode setup(const std::vector<Functional> &functionals);
   PetscErrorCode create(VecHandle &local) const;
   Wanted &wanted(Pending &pending, PetscInt stage, std::size_t functional) const;
+  /// Fills in the changes of all shifts of a stage, of which @p pending is what later stages want.
+  PetscErrorCode make_shifts(PetscInt stage, const Pending &pending);
   void want_row(const std::vector<Functional> &functionals, PetscInt stage, Pending &pending) const;
   /// Adds a derivative by the pressure at the ventilator at the end of a stage, 1/kPa.
   void want_ventilator_pressure(PetscInt stage, PetscReal derivative, Wanted &wanted) const;
@@ -131,10 +148,12 @@ private:
   const Trajectory &trajectory_;
   std::unique_ptr<MemorySweep> memory_; ///< null: nothing follows from what is remembered
   std::vector<Wanted> start_;           ///< of the start, once all is swept
-  std::size_t count_ = 0;               ///< of the numbers
-  KSP ksp_ = nullptr;                   ///< of the run
-  bool gas_ = false;                    ///< there is a mass balance
-  bool targets_ = false;                ///< are asked for
+  std::vector<Shift *> shifts_;
+  std::vector<std::vector<PetscInt>> parts_; ///< [number]: cells of this rank of the part that it is of
+  std::size_t count_ = 0;                    ///< of the numbers
+  KSP ksp_ = nullptr;                        ///< of the run
+  bool gas_ = false;                         ///< there is a mass balance
+  bool targets_ = false;                     ///< are asked for
   std::optional<bool> other_rates_;
   struct {
     PetscInt age = 0;

@@ -97,8 +97,9 @@ public:
   /// int cof F(x) : Grad y, the derivative of int (J - 1) in direction @p y, mm^3. Collective.
   PetscErrorCode volume_derivative(Vec x, Vec y, PetscReal &derivative) const;
   /// Adds @p factor times the derivative of int (J - 1) q by the displacements to @p y; q is the pressure field of @p
-  /// weight, or 1 if that is null. Local vectors.
-  PetscErrorCode add_volume_gradient(Vec x, Vec weight, PetscReal factor, Vec y);
+  /// weight, or 1 if that is null. Local vectors. @p cells: of this rank, all of them if null.
+  PetscErrorCode add_volume_gradient(Vec x, Vec weight, PetscReal factor, Vec y,
+                                     const std::vector<PetscInt> *cells = nullptr);
   /// int (J - 1) q, mm^3, cell by cell; q is the pressure field of each of @p weights. Local vectors.
   /// @p sums: [weight][cell of this rank].
   PetscErrorCode weighted_volume(Vec x, const std::vector<Vec> &weights, std::vector<std::vector<PetscReal>> &sums);

@@ -99,9 +99,10 @@ public:
     return assembly_.volume_derivative(x, y, derivative);
   }
   /// Adds @p factor times the derivative of int (J - 1) q by the displacements to @p y (Assembly::add_volume_gradient).
-  PetscErrorCode add_volume_gradient(Vec x, Vec weight, PetscReal factor, Vec y)
+  PetscErrorCode add_volume_gradient(Vec x, Vec weight, PetscReal factor, Vec y,
+                                     const std::vector<PetscInt> *cells = nullptr)
   {
-    return assembly_.add_volume_gradient(x, weight, factor, y);
+    return assembly_.add_volume_gradient(x, weight, factor, y, cells);
   }
   /// int (J - 1) q cell by cell (Assembly::weighted_volume).
   PetscErrorCode weighted_volume(Vec x, const std::vector<Vec> &weights, std::vector<std::vector<PetscReal>> &sums)

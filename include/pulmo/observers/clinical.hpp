@@ -44,7 +44,7 @@ constexpr double least_movement = 1e-9;
 
 /// A number of a breath as it is listed.
 struct ClinicalEntry {
-  const char *key, *label, *unit; ///< key: in summary.json
+  std::string key, label, unit; ///< key: in summary.json
   std::optional<double> value;
 };
 

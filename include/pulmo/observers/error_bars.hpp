@@ -32,6 +32,13 @@ struct LackingParts {
   double flow_in_space = 0, tissue_in_space = 0, solver = 0;
 };
 
+/// What a number changes by, in its unit and to first order, if the last breath is repeated. It is in no bar: the run
+/// is what it is, and more breaths are another one.
+struct MoreBreaths {
+  double next = 0;                ///< by one more breath
+  std::optional<double> periodic; ///< until breaths are periodic; empty where one breath does not tell that
+};
+
 /// A clinical number with what the discretisation makes it wrong by, each part in the number's unit. A part that could
 /// not be had is empty.
 struct ErrorBar {
@@ -41,7 +48,8 @@ struct ErrorBar {
   std::optional<LackingParts> lacks; ///< by a sweep
   std::optional<double> corrected;   ///< the value with what it lacks, where its sign is known
   std::optional<double> corrected_error;
-  std::string unresolved; ///< why a part is empty, for one who reads the table
+  std::optional<MoreBreaths> more_breaths; ///< by a sweep
+  std::string unresolved;                  ///< why a part is empty, for one who reads the table
 
   /// The sum of the parts (they may all point the same way); empty if one is missing.
   std::optional<double> total() const;

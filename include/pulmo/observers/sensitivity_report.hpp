@@ -23,6 +23,8 @@ struct SensitivityReport {
     bool varies = false;            ///< parts of the lung have values of their own
     std::vector<double> derivative; ///< [number], in its unit per that of the parameter, if it changes alike everywhere
     std::vector<std::pair<std::string, std::vector<double>>> by_region; ///< the same if it changes in that region alone
+    std::vector<std::vector<double>>
+        by_cell; ///< [number][cell of this rank]: in that cell alone; empty: no cell reads it
   };
 
   /// A parameter without derivatives.

@@ -11,6 +11,7 @@ class FieldWriter;
 class Model;
 class Output;
 class Recording;
+class RegionAudit;
 class Registry;
 class Scene;
 class Simulation;
@@ -36,11 +37,10 @@ public:
   PetscErrorCode make(const Options &options, const Output &output, const Scene &scene, const Simulation &simulation,
                       const std::vector<ClinicalEntry> &numbers, ErrorReport &report) const;
 
-  /// The same by a sweep back over the recorded run, whose complete signals are @p rows. The part in space goes by
+  /// The same by a sweep back over the recorded run, which @p regions have followed. The part in space goes by
   /// cells to errors.xdmf, through @p fields.
   PetscErrorCode make_by_sweep(const Options &options, const Scene &scene, Model &model, Simulation &simulation,
-                               const Recording &recording, const std::vector<SignalRow> &rows,
-                               const std::vector<ClinicalEntry> &numbers, FieldWriter &fields,
+                               const Recording &recording, const RegionAudit &regions, FieldWriter &fields,
                                ErrorReport &report) const;
 
 private:

@@ -1,0 +1,93 @@
+#include "pulmo/adjoint/periodicity.hpp"
+
+#include "pulmo/observers/clinical.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+namespace pulmo {
+
+namespace {
+
+/// Changes below this share of a number end the series: what a sweep leaves of its systems.
+constexpr double least = 1e-6;
+
+/// Times that differ by less than this share are the same.
+constexpr double same_time = 1e-9;
+
+/// What the ventilator does in a breath.
+std::vector<Phase> phases_of(const Programme &programme, int breath)
+{
+  std::vector<Phase> list;
+  for (const Phase &phase : programme.phases())
+    if (phase.breath == breath) list.push_back(phase);
+  return list;
+}
+
+bool alike(const std::vector<Phase> &a, const std::vector<Phase> &b)
+{
+  return std::equal(a.begin(), a.end(), b.begin(), b.end(), [](const Phase &p, const Phase &q) {
+    const PetscReal duration = p.end - p.begin;
+    return std::abs(duration - (q.end - q.begin)) <= same_time * q.end && p.control == q.control && p.to == q.to &&
+           p.ramp == q.ramp && p.limit == q.limit;
+  });
+}
+
+} // namespace
+
+Periodicity::Periodicity(const Scene &scene, const std::vector<SignalRow> &rows, const Trajectory &trajectory)
+    : rows_(rows)
+{
+  const Programme &programme = *scene.facts().ventilator;
+  const auto breaths = complete_breaths(rows);
+  if (breaths.empty() || programme.may_end_early()) return; // ends that move are no map of states
+  const auto stage_of = [&](std::size_t row) {
+    const auto &stages = trajectory.stages();
+    const auto found = std::find_if(stages.begin(), stages.end(),
+                                    [&](const StageRecord &r) { return r.row == static_cast<PetscInt>(row); });
+    return static_cast<PetscInt>(found - stages.begin());
+  };
+  first_ = breaths.back().first;
+  last_ = breaths.back().last;
+  const PetscInt from = stage_of(first_), to = stage_of(last_);
+  const std::vector<Phase> repeated = phases_of(programme, rows[last_].breath);
+  for (std::size_t i = breaths.size(), begin = last_; i-- > 0 && breaths[i].last == begin; begin = breaths[i].first) {
+    if (!alike(phases_of(programme, rows[breaths[i].last].breath), repeated)) break;
+    shifts_.push_back({stage_of(breaths[i].first), from, to, {}});
+  }
+  // one that differs from the breath before it is no breath among others
+  if (breaths.size() > 1 && shifts_.size() == 1) shifts_.clear();
+}
+
+void Periodicity::ask(Sweep &sweep)
+{
+  for (Sweep::Shift &shift : shifts_) sweep.ask_shift(shift);
+}
+
+std::optional<MoreBreaths> Periodicity::change(const Functional &f, std::size_t k) const
+{
+  if (shifts_.empty()) return {};
+  std::vector<double> terms;
+  for (const Sweep::Shift &shift : shifts_) terms.push_back(shift.change[k]);
+  if (!f.from_rest) { // the number looks at the start itself
+    const SignalRow &from = rows_[first_], &to = rows_[last_];
+    const double volume = f.part ? f.part->volume[last_] - f.part->volume[first_] : to.volume - from.volume;
+    terms.front() += f.by_volume[first_] * volume +
+                     f.by_pressure[first_] * (to.machine_pressure() - from.machine_pressure()) +
+                     f.by_flow[first_] * (to.flow - from.flow);
+  }
+  MoreBreaths more;
+  more.next = terms.front();
+  double sum = 0;
+  for (const double term : terms) sum += term;
+  const double last = terms.back();
+  if (std::abs(last) <= least * std::abs(f.value))
+    more.periodic = sum;
+  else if (terms.size() > 1) {
+    const double ratio = last / terms[terms.size() - 2];
+    if (std::abs(ratio) < 1) more.periodic = sum + last * ratio / (1 - ratio);
+  }
+  return more;
+}
+
+} // namespace pulmo
