@@ -1,6 +1,7 @@
 #include "pulmo/adjoint/enrichment.hpp"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <memory>
 
@@ -62,11 +63,12 @@ PetscErrorCode Enrichment::setup(Model &model)
 {
   Composition composition = model.composition().enriched(field_);
   const PetscInt exact = exact_degree(composition.elements().displacement_degree);
+  const PetscInt for_pressure = 2 * composition.elements().pressure_degree - 1;
 
   PetscFunctionBeginUser;
   run_ = &model;
-  // with a richer pressure as in the run: what that has solved is solved here, too
-  rich_.integrate_to(field_ == displacement ? std::max(model.quadrature_degree(), exact) : model.quadrature_degree());
+  // with a richer pressure no more than that takes: what the run has solved is solved here, too
+  rich_.integrate_to(std::max(model.quadrature_degree(), field_ == displacement ? exact : for_pressure));
   PetscCall(rich_.build(std::move(composition), model.modulus()));
   for (VecHandle *v : {&x_, &rate_, &diagonal_, &stiffness_, &work_, &other_}) {
     PetscCall(DMCreateLocalVector(rich_.dm(), v->out()));
@@ -176,8 +178,12 @@ PetscErrorCode Enrichment::weigh(const StageRecord &record, Mat matrix)
   WriteArray diagonal(diagonal_);
   const ReadArray stiffness(stiffness_);
   const CellLayout &layout = rich_.assembly().layout();
+  blocks_.clear();
+  block_places_.clear();
+  block_entries_.clear();
   const auto take = [&](PetscInt cell, const PetscScalar *entries) -> PetscErrorCode {
     const PetscInt *dofs = layout.cell_dofs(cell), n = layout.size;
+    if (!gas) keep_block(dofs, entries);
     const auto scale = [&](PetscInt i) { return rich_.row_scale(layout.field_of[i]); };
     for (PetscInt j = 0; j < n; ++j) {
       const PetscInt function = function_of_[dofs[j]];
@@ -214,10 +220,111 @@ PetscErrorCode Enrichment::add_at_functions(Vec local, Vec sum) const
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+void Enrichment::keep_block(const PetscInt *dofs, const PetscScalar *entries)
+{
+  const CellLayout &layout = rich_.assembly().layout();
+  const PetscInt n = layout.size;
+  std::vector<std::array<PetscInt, 2>>
+      nodes; // of each function, counted in the cell; the second: -1, or minus one there
+  for (PetscInt i = 0; i < n; ++i) {
+    const PetscInt function = function_of_[dofs[i]];
+    if (function <= 0) continue;
+    const Function &f = functions_[static_cast<std::size_t>(function) - 1];
+    const PetscInt partner = f.other >= 0 ? dofs[i] + f.other - f.dof : -1;
+    const PetscInt *there = std::find(dofs, dofs + n, partner);
+    nodes.push_back({i, there < dofs + n ? static_cast<PetscInt>(there - dofs) : -1});
+  }
+  blocks_.push_back({static_cast<PetscInt>(nodes.size()), block_places_.size(), block_entries_.size()});
+  for (const auto &column : nodes) {
+    block_places_.push_back(dofs[column[0]]);
+    for (const auto &row : nodes) {
+      PetscReal sum = 0;
+      for (int a = 0; a < 2; ++a)
+        for (int b = 0; b < 2; ++b)
+          if (row[a] >= 0 && column[b] >= 0) sum += (a == b ? 1 : -1) * entries[row[a] * n + column[b]];
+      block_entries_.push_back(static_cast<float>(rich_.row_scale(displacement) * sum));
+    }
+  }
+}
+
+PetscErrorCode Enrichment::apply_blocks(Vec x, Vec y)
+{
+  PetscFunctionBeginUser;
+  PetscCall(VecZeroEntries(work_));
+  PetscCall(DMGlobalToLocal(rich_.dm(), x, INSERT_VALUES, work_));
+  PetscCall(VecZeroEntries(other_));
+  {
+    const ReadArray from(work_);
+    WriteArray to(other_);
+    for (const Block &b : blocks_) {
+      const PetscInt *places = block_places_.data() + b.places;
+      const float *entries = block_entries_.data() + b.entries;
+      for (PetscInt i = 0; i < b.size; ++i)
+        for (PetscInt j = 0; j < b.size; ++j) to[places[i]] += entries[i * b.size + j] * from[places[j]];
+    }
+  }
+  PetscCall(VecZeroEntries(y));
+  PetscCall(DMLocalToGlobal(rich_.dm(), other_, ADD_VALUES, y));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Enrichment::solve_blocks(Vec weights)
+{
+  constexpr PetscReal enough = 0.01; // of what is left: the estimate is worth no more
+  constexpr int most = 30;
+  PetscReal before, start;
+
+  PetscFunctionBeginUser;
+  PetscCall(VecZeroEntries(global_));
+  PetscCall(DMLocalToGlobal(rich_.dm(), weights, INSERT_VALUES, left_));
+  PetscCall(VecScale(left_, -1));
+  PetscCall(VecPointwiseMult(direction_, inverse_, left_));
+  PetscCall(VecDot(left_, direction_, &before));
+  start = before;
+  for (int i = 0; i < most && before > enough * enough * start; ++i) {
+    PetscReal along, now;
+    PetscCall(apply_blocks(direction_, product_));
+    PetscCall(VecDot(direction_, product_, &along));
+    if (along <= 0) { // unstable in this direction: what was found before
+      if (i == 0) PetscCall(VecCopy(direction_, global_));
+      break;
+    }
+    PetscCall(VecAXPY(global_, before / along, direction_));
+    PetscCall(VecAXPY(left_, -before / along, product_));
+    PetscCall(VecPointwiseMult(product_, inverse_, left_));
+    PetscCall(VecDot(left_, product_, &now));
+    PetscCall(VecAYPX(direction_, now / before, product_));
+    before = now;
+  }
+  PetscCall(VecZeroEntries(weights));
+  PetscCall(DMGlobalToLocal(rich_.dm(), global_, INSERT_VALUES, weights));
+  WriteArray z(weights);
+  for (const Function &f : functions_)
+    for (PetscInt c = 0; f.other >= 0 && c < components(); ++c) z[f.other + c] = -z[f.dof + c];
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode Enrichment::solve()
 {
   PetscFunctionBeginUser;
   PetscCall(sum_up(diagonal_, false));
+  if (field_ == displacement) {
+    for (VecHandle *v : {&inverse_, &left_, &direction_, &product_})
+      if (!*v) PetscCall(VecDuplicate(global_, v->out()));
+    PetscCall(VecZeroEntries(work_));
+    {
+      const ReadArray diagonal(diagonal_);
+      WriteArray inverse(work_);
+      for (const Function &f : functions_)
+        for (PetscInt c = 0; c < components(); ++c) {
+          const PetscReal d = diagonal[f.dof + c];
+          inverse[f.dof + c] = d > 0 ? 1 / d : 0; // not positive: unstable there, or prescribed
+        }
+    }
+    PetscCall(DMLocalToGlobal(rich_.dm(), work_, INSERT_VALUES, inverse_));
+    for (VecHandle &weight : weights_) PetscCall(solve_blocks(weight));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
   const ReadArray diagonal(diagonal_);
   for (VecHandle &weight : weights_) {
     WriteArray z(weight);

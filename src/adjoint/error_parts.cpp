@@ -11,7 +11,10 @@ namespace pulmo {
 namespace {
 
 /// The displacement is looked at in one of so many stages, and in so many at least.
-constexpr PetscInt stages_a_sample = 12, least_samples = 5;
+constexpr std::size_t stages_a_sample = 12, least_samples = 5;
+
+/// Of a number that looks at no more stages than these, each is looked at.
+constexpr std::size_t few_stages = 3;
 
 using ByCell = std::vector<std::vector<PetscReal>>;
 
@@ -63,10 +66,45 @@ std::vector<double> ErrorParts::kinks() const
   return times;
 }
 
-PetscErrorCode ErrorParts::setup(std::size_t count)
+void ErrorParts::choose_samples(const std::vector<Functional> &functionals)
 {
   const auto &stages = trajectory_.stages();
-  const auto last = static_cast<PetscInt>(stages.size()) - 1;
+  const auto count = static_cast<PetscInt>(stages.size());
+  std::vector<bool> alone(stages.size(), false);
+  PetscInt last = 0; // that matters
+  for (const Functional &f : functionals) {
+    std::vector<PetscInt> wanted;
+    for (PetscInt n = 1; n < count; ++n) {
+      const PetscInt row = stages[static_cast<std::size_t>(n)].row;
+      if (row < 0) continue;
+      const auto i = static_cast<std::size_t>(row);
+      if (f.by_volume[i] != 0 || f.by_pressure[i] != 0 || f.by_flow[i] != 0) wanted.push_back(n);
+    }
+    if (!wanted.empty()) last = std::max(last, wanted.back());
+    if (wanted.size() <= few_stages)
+      for (const PetscInt n : wanted) alone[static_cast<std::size_t>(n)] = true;
+  }
+  std::vector<PetscInt> others;
+  sample_of_.assign(stages.size(), -1);
+  for (PetscInt n = 1; n <= last; ++n) {
+    if (alone[static_cast<std::size_t>(n)])
+      sample_of_[static_cast<std::size_t>(n)] = n;
+    else
+      others.push_back(n);
+  }
+  // without gas each stage stands for itself
+  const std::size_t size = others.size(),
+                    samples = gas_ ? std::min(size, std::max(least_samples, size / stages_a_sample)) : size;
+  for (std::size_t s = 0; s < samples; ++s) {
+    const std::size_t begin = size * s / samples, end = size * (s + 1) / samples;
+    for (std::size_t i = begin; i < end; ++i)
+      sample_of_[static_cast<std::size_t>(others[i])] = others[(begin + end) / 2];
+  }
+}
+
+PetscErrorCode ErrorParts::setup(const std::vector<Functional> &functionals)
+{
+  const std::size_t count = functionals.size();
   const auto cells = static_cast<std::size_t>(model_.assembly().cells());
   PetscInt fields;
 
@@ -75,22 +113,12 @@ PetscErrorCode ErrorParts::setup(std::size_t count)
   gas_ = fields > pressure;
   lacking_.assign(count, {});
   rough_.assign(count, 0);
-  for (ByCell *part : {&solver_, &time_, &flow_part_, &tissue_part_})
+  for (ByCell *part : {&solver_, &time_, &flow_part_, &tissue_part_, &group_.part})
     part->assign(count, std::vector<PetscReal>(cells, 0));
   PetscCall(DMCreateLocalVector(model_.dm(), state_.out()));
   if (gas_) PetscCall(flow_.emplace(pressure).setup(model_));
   PetscCall(tissue_.emplace(displacement).setup(model_));
-  // without gas each stage stands for itself
-  const PetscInt samples = gas_ ? std::min(last, std::max(least_samples, last / stages_a_sample)) : last;
-  // a stage in the middle of as many groups of stages, and the time of its group over its own
-  for (PetscInt s = 0; s < samples; ++s) {
-    const PetscInt begin = 1 + last * s / samples, end = 1 + last * (s + 1) / samples;
-    if (begin == end) continue;
-    PetscReal time = 0;
-    for (PetscInt n = begin; n < end; ++n) time += 1 / stages[static_cast<std::size_t>(n)].stage.slope;
-    const PetscInt middle = (begin + end) / 2;
-    sampled_[middle] = time * stages[static_cast<std::size_t>(middle)].stage.slope;
-  }
+  choose_samples(functionals);
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -194,6 +222,41 @@ PetscErrorCode ErrorParts::add_other_rates(const Sweep::Solved &stage, const Cha
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode ErrorParts::sizes(const Sweep::Solved &stage, std::vector<PetscReal> &sums) const
+{
+  const CellLayout &layout = model_.assembly().layout();
+
+  PetscFunctionBeginUser;
+  sums.clear();
+  const ReadArray u(stage.state);
+  for (const Vec adjoint : stage.adjoint) {
+    const ReadArray z(adjoint);
+    PetscReal sum = 0;
+    for (PetscInt c = 0; c < layout.cells; ++c)
+      for (PetscInt i = 0; i < layout.size; ++i)
+        if (layout.field_of[i] == displacement) {
+          const PetscInt dof = layout.cell_dofs(c)[i];
+          sum += std::abs(z[dof] * u[dof]);
+        }
+    sums.push_back(sum);
+  }
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, sums.data(), static_cast<PetscMPIInt>(sums.size()), MPIU_REAL, MPI_SUM,
+                             PetscObjectComm((PetscObject)model_.dm())));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+void ErrorParts::end_group()
+{
+  for (std::size_t k = 0; group_.sample >= 0 && k < group_.part.size(); ++k) {
+    const PetscReal stands_for = group_.sampled[k] > 0 ? group_.all[k] / group_.sampled[k] : 0;
+    for (std::size_t c = 0; c < group_.part[k].size(); ++c) {
+      tissue_part_[k][c] += stands_for * group_.part[k][c];
+      group_.part[k][c] = 0;
+    }
+  }
+  group_.sample = -1;
+}
+
 PetscErrorCode ErrorParts::add_space(const Sweep::Solved &stage)
 {
   const StageRecord &record = stage.record;
@@ -210,7 +273,7 @@ PetscErrorCode ErrorParts::add_space(const Sweep::Solved &stage)
   }
   if (flow_) PetscCall(flow_->add(stage, later, past, simulation_.matrix(), 1, flow_part_, &solver_));
   for (int i = 0; gas_ && i < 2; ++i) {
-    if (record.past[i] < 0 || sampled_.count(record.past[i]) == 0) continue;
+    if (record.past[i] < 0 || sample_of_[static_cast<std::size_t>(record.past[i])] != record.past[i]) continue;
     Kept kept{record.weight[i] * model_.row_scale(pressure), {}};
     for (const Vec z : stage.adjoint) {
       VecHandle copy;
@@ -220,11 +283,21 @@ PetscErrorCode ErrorParts::add_space(const Sweep::Solved &stage)
     }
     later_[record.past[i]].push_back(std::move(kept));
   }
-  const auto sample = sampled_.find(stage.number);
-  if (sample == sampled_.end()) PetscFunctionReturn(PETSC_SUCCESS);
+  const PetscInt sample = sample_of_[static_cast<std::size_t>(stage.number)];
+  std::vector<PetscReal> size;
+  PetscCall(sizes(stage, size));
+  if (sample != group_.sample) {
+    end_group();
+    group_.sample = sample;
+    group_.all.assign(size.size(), 0);
+    group_.sampled = group_.all;
+  }
+  for (std::size_t k = 0; k < size.size(); ++k) group_.all[k] += size[k];
+  if (sample != stage.number) PetscFunctionReturn(PETSC_SUCCESS);
+  group_.sampled = size;
   for (const Kept &kept : later_[stage.number])
     later.push_back({kept.factor, {kept.adjoint.begin(), kept.adjoint.end()}});
-  PetscCall(tissue_->add(stage, later, past, simulation_.matrix(), sample->second, tissue_part_, nullptr));
+  PetscCall(tissue_->add(stage, later, past, simulation_.matrix(), 1, group_.part, nullptr));
   later_.erase(stage.number);
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -262,9 +335,10 @@ PetscErrorCode ErrorParts::run(Sweep &sweep, const std::vector<Functional> &func
   std::vector<PetscReal> sums;
 
   PetscFunctionBeginUser;
-  PetscCall(setup(functionals.size()));
+  PetscCall(setup(functionals));
   PetscCall(sweep.run(
       functionals, tolerance, [&](const Sweep::Solved &stage) { return visit(sweep, stage); }, failure));
+  end_group();
   PetscCall(total(solver_, sums));
   for (std::size_t k = 0; k < sums.size(); ++k) lacking_[k].solver += sums[k];
   PetscCall(total(time_, sums));

@@ -13,7 +13,7 @@ namespace pulmo {
 /// the number of a run with richer elements is G + sum of z' . R to first order, where z' are the multipliers of what
 /// the richer elements have beyond the run's. These solve a system with the block of the Jacobian among them alone, in
 /// the sense of hierarchical estimates (Bank & Smith, SIAM J. Numer. Anal. 30, 1993, 921-935; for numbers of interest
-/// Becker & Rannacher, Acta Numerica 10, 2001, 1-102), of which the diagonal is taken.
+/// Becker & Rannacher, Acta Numerica 10, 2001, 1-102): of the pressure its diagonal, of the displacement the whole.
 class Enrichment {
 public:
   /// @p field: displacement or pressure.
@@ -62,6 +62,12 @@ private:
   /// Adds to weights_ the rows of the transposed Jacobian times z_, and makes the diagonal of its block, for the new
   /// functions, at the first node of each; to be summed up.
   PetscErrorCode weigh(const StageRecord &record, Mat matrix);
+  /// Keeps the block of a cell's matrix among the new functions.
+  void keep_block(const PetscInt *dofs, const PetscScalar *entries);
+  /// @p y = the kept blocks, transposed, times @p x; global vectors, rich. @p y is zero where no new function is free.
+  PetscErrorCode apply_blocks(Vec x, Vec y);
+  /// Solves the kept blocks for the weights of one number, by conjugate gradients.
+  PetscErrorCode solve_blocks(Vec weights);
   /// Adds a local vector, as the new functions see it, to @p sum.
   PetscErrorCode add_at_functions(Vec local, Vec sum) const;
   /// Makes weights_ the multipliers of the new functions.
@@ -79,8 +85,15 @@ private:
       function_of_; ///< of a dof of the local vector: sign times (number of the function + 1); 0: none
   VecHandle x_, rate_, diagonal_, stiffness_, work_, other_; ///< local, rich
   std::vector<VecHandle> z_, weights_; ///< [number]: local, rich: multipliers of the run; of new functions
-  VecHandle global_;
-  VecHandle run_work_, run_global_; ///< local and global, of the run
+  struct Block {                       ///< of a cell's matrix among its new functions
+    PetscInt size;
+    std::size_t places, entries; ///< the first of these
+  };
+  std::vector<Block> blocks_;
+  std::vector<PetscInt> block_places_;                      ///< in the local vector, of the first node
+  std::vector<float> block_entries_;                        ///< many, and worth few digits
+  VecHandle global_, inverse_, left_, direction_, product_; ///< global, rich
+  VecHandle run_work_, run_global_;                         ///< local and global, of the run
 };
 
 } // namespace pulmo

@@ -15,8 +15,9 @@ namespace pulmo {
 /// time    rates of one order more: the polynomial through states of the phase before and after the stage. Beside
 ///         that the number itself is a sum over the rows, and its largest values lie between them
 ///         (Functional::better_value);
-/// space   elements one degree richer (Enrichment): for the pressure in every stage, for the displacement in one of
-///         twelve, without airflow in all.
+/// space   elements one degree richer (Enrichment): for the pressure in every stage; for the displacement, without
+///         airflow in every stage, else in one of twelve, which stands for those around it by the size of multipliers
+///         and displacements there, and where a number looks at a single stage in that.
 class ErrorParts {
 public:
   ErrorParts(const Scene &scene, Model &model, Simulation &simulation, const Trajectory &trajectory)
@@ -43,11 +44,17 @@ private:
     std::vector<VecHandle> adjoint;
   };
 
-  PetscErrorCode setup(std::size_t count);
+  PetscErrorCode setup(const std::vector<Functional> &functionals);
+  /// Chooses the stages where the displacement is looked at.
+  void choose_samples(const std::vector<Functional> &functionals);
   PetscErrorCode visit(const Sweep &sweep, const Sweep::Solved &stage);
   PetscErrorCode add_solver(const Sweep::Solved &stage);
   PetscErrorCode add_time(const Sweep &sweep, const Sweep::Solved &stage);
   PetscErrorCode add_space(const Sweep::Solved &stage);
+  /// [number]: sum of |z u| over the displacements.
+  PetscErrorCode sizes(const Sweep::Solved &stage, std::vector<PetscReal> &sums) const;
+  /// Adds what the sample of the group at hand found, for all stages of the group.
+  void end_group();
   /// Stages, and by how much their weight in a better rate of a stage exceeds that in its own, 1/s.
   using Changes = std::vector<std::pair<PetscInt, PetscReal>>;
   /// @p rough: there are too few between two kinks.
@@ -61,9 +68,14 @@ private:
   const Trajectory &trajectory_;
   bool gas_ = false;
   std::optional<Enrichment> flow_, tissue_;
-  std::map<PetscInt, PetscReal> sampled_;       ///< stages where the displacement is looked at, and whom they stand for
+  std::vector<PetscInt> sample_of_;             ///< [stage]: where the displacement is looked at for it, too
   std::map<PetscInt, std::vector<Kept>> later_; ///< [stage]
-  std::vector<PetscReal> rough_;                ///< [number]
+  struct {
+    PetscInt sample = -1;
+    std::vector<PetscReal> all, sampled; ///< [number]: sizes
+    ByCell part;
+  } group_;                      ///< stages with one sample
+  std::vector<PetscReal> rough_; ///< [number]
   std::vector<LackingParts> lacking_;
   ByCell solver_, time_, flow_part_, tissue_part_, in_space_;
   VecHandle state_; ///< local
