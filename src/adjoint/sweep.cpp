@@ -83,8 +83,10 @@ PetscErrorCode Sweep::setup()
 Sweep::Wanted &Sweep::wanted(Pending &pending, PetscInt stage, std::size_t functional) const
 {
   std::vector<Wanted> &all = pending[stage];
-  all.resize(count_);
-  all[functional].scalars.resize(storages_.size(), 0);
+  if (all.empty()) {
+    all.resize(count_);
+    for (Wanted &one : all) one.scalars.resize(storages_.size(), 0);
+  }
   return all[functional];
 }
 
