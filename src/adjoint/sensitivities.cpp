@@ -196,16 +196,16 @@ PetscErrorCode find_parameters(const Options &options, const Scene &scene, const
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-/// The derivatives by a parameter of the equations of a stage that no kernel is part of, times their multipliers:
-/// [number]; empty: it is one of kernels.
-std::vector<PetscReal> derivative_outside(const Sweep &sweep, const Sweep::Solved &stage, const Parameter &p)
+/// Adds the derivatives by a parameter of the equations of a stage that no kernel is part of, times their multipliers,
+/// by number.
+void add_outside_kernels(const Sweep &sweep, const Sweep::Solved &stage, const Parameter &p, std::vector<double> &sums)
 {
   const PetscReal Q = sweep.flow(stage.number), change = 2 * p.change();
   std::vector<PetscReal> by, less;
   PetscReal factor = 0;
   switch (p.reader) {
   case Reader::kernels:
-    return {};
+    return;
   case Reader::ventilator:
     by = stage.by_target;
     factor = (target(stage.record, p.more) - target(stage.record, p.less)) / change;
@@ -220,8 +220,7 @@ std::vector<PetscReal> derivative_outside(const Sweep &sweep, const Sweep::Solve
     for (std::size_t k = 0; k < by.size(); ++k) by[k] -= less[k];
     factor = 1 / change;
   }
-  for (PetscReal &one : by) one *= factor;
-  return by;
+  for (std::size_t k = 0; k < by.size(); ++k) sums[k] += by[k] * factor;
 }
 
 using ByCell = std::vector<std::vector<PetscReal>>; ///< [number][cell of this rank]
@@ -350,11 +349,8 @@ PetscErrorCode add_derivatives(const Options &options, const Scene &scene, Model
   sweep.ask_targets();
   const auto visit = [&](const Sweep::Solved &stage) -> PetscErrorCode {
     PetscFunctionBeginUser;
-    for (std::size_t i = 0; i < parameters.size() && rank == 0; ++i) {
-      const Parameter &p = parameters[i];
-      const std::vector<PetscReal> derivative = derivative_outside(sweep, stage, p);
-      for (std::size_t k = 0; k < derivative.size(); ++k) report.parameters[i].derivative[k] += derivative[k];
-    }
+    for (std::size_t i = 0; i < parameters.size() && rank == 0; ++i)
+      add_outside_kernels(sweep, stage, parameters[i], report.parameters[i].derivative);
     PetscCall(
         move_parameters(true, [&](bool facets, ByCell &sums) { return sweep.weighted_residual(stage, facets, sums); }));
     PetscFunctionReturn(PETSC_SUCCESS);
