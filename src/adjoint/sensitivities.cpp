@@ -26,18 +26,18 @@ constexpr PetscReal larger_difference = 1e-6;
 /// Who reads a parameter of the scene.
 enum class Reader { kernels, ventilator, scalars, tube };
 
+/// A parameter of the scene.
 struct Parameter {
   Options::RealOption option;
   Reader reader = Reader::ventilator;
-  std::vector<PetscInt>
-      places;             ///< among the constants of kernels (Composition::constant_at); none: they read it in place
-  bool on_facets = false; ///< nothing in the volume reads it
-  bool varies = false;    ///< it differs from place to place
-  PetscReal size = 0;     ///< of its values, wherever they are
-  PetscReal share = difference;          ///< of that, by which it is moved
-  PetscReal effect = 0;                  ///< the largest share of the residual that this changes
-  std::vector<Phase> less, more;         ///< the ventilator's phases with less and more of it
-  bool adds_up = false;                  ///< an effect reads it that remembers
+  std::vector<PetscInt> places;  ///< among the constants of kernels (constant_at()); none: they read it in place
+  bool on_facets = false;        ///< nothing in the volume reads it
+  bool varies = false;           ///< it differs from place to place
+  PetscReal size = 0;            ///< of its values, wherever they are
+  PetscReal share = difference;  ///< of that, by which it is moved
+  PetscReal effect = 0;          ///< the largest share of the residual that this changes
+  std::vector<Phase> less, more; ///< the ventilator's phases with less and more of it
+  bool adds_up = false;          ///< an effect reads it that remembers
   AirwayResistance less_tube, more_tube; ///< the same of the tube
   PetscReal change() const { return share * size; }
 };

@@ -68,10 +68,9 @@ std::ostream &operator<<(std::ostream &out, const Breath &b)
 }
 
 /// The forward sensitivity of a run to one parameter of its kernels: the linearised steps, one after the other. Pasts
-/// come from matrices of the Jacobian with and without its rates and from differences of the gas, where the sweep has
-/// the derivative of the volume; the equations of scalars are differences, where it has what an effect says of them;
-/// what is remembered follows along the change of the state, where the sweep goes point by point through all that a
-/// kernel reads.
+/// come from matrices of the Jacobian with and without its rates, where the sweep has the derivative of the volume; the
+/// equations of scalars are differences, where it has what an effect says of them; what is remembered follows along the
+/// change of the state, where the sweep goes point by point through all that a kernel reads.
 class Tangent {
 public:
   Tangent(SceneRun &run, const Trajectory &trajectory, PetscInt constant, PetscReal change)
@@ -148,58 +147,30 @@ private:
     PetscReal volume = 0, ventilator = 0;
     std::vector<PetscReal> scalars;
   };
-  /// int (J - 1) q, as the mass rows have it at the row scale of a stage of 1 s.
-  PetscErrorCode gas(PetscReal t, Vec x, Vec global)
+  /// Adds minus what the states before move in the equations, while the airway is free. Kernels see the rate at the
+  /// state of the stage; of multistep rates, which act by the gas alone here, the scheme knows that at the state
+  /// before.
+  PetscErrorCode add_past(const StageRecord &r, Vec right)
   {
-    PetscFunctionBeginUser;
-    PetscCall(VecZeroEntries(global));
-    for (const PetscReal slope : {1., 0.}) {
-      PetscCall(model_.set_step({1, slope, true}, 0));
-      PetscCall(model_.residual(t, x, zero_, local_F_));
-      if (slope == 0) PetscCall(VecScale(local_F_, -1));
-      PetscCall(DMLocalToGlobal(model_.dm(), local_F_, ADD_VALUES, global));
-    }
-    PetscFunctionReturn(PETSC_SUCCESS);
-  }
-  /// Adds @p factor times the change of that at @p x along @p direction; a cubic, so that four points are exact.
-  PetscErrorCode add_gas_change(PetscReal t, Vec x, Vec direction, PetscReal factor, Vec right)
-  {
-    constexpr PetscReal small = 0.02; // beside a cell: the tissue is there at all four
-    PetscReal size[2];
-    PetscFunctionBeginUser;
-    PetscCall(VecNorm(x, NORM_INFINITY, &size[0]));
-    PetscCall(VecNorm(direction, NORM_INFINITY, &size[1]));
-    PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, size, 2, MPIU_REAL, MPI_MAX, PetscObjectComm((PetscObject)model_.dm())));
-    const PetscReal step = size[0] > 0 && size[1] > 1e-100 ? small * size[0] / size[1] : 1;
-    for (const auto &[times, weight] : four_points) {
-      PetscCall(VecWAXPY(moved_, times * step, direction, x));
-      PetscCall(gas(t, moved_, other_));
-      PetscCall(VecAXPY(right, factor * weight / step, other_));
-    }
-    PetscFunctionReturn(PETSC_SUCCESS);
-  }
-  /// Adds minus what the states before move in the equations. @p A, @p A0: the Jacobian with and without its rates.
-  PetscErrorCode add_past(const StageRecord &r, Mat A, Mat A0, Vec right)
-  {
-    const PetscReal L = model_.composition().mesh().length(), scale = model_.row_scale(pressure) * L * L * L;
     PetscFunctionBeginUser;
     for (int i = 0; i < 2; ++i) {
       if (r.past[i] < 0) continue;
-      const Vec direction = of_[static_cast<std::size_t>(r.past[i])].state;
       const PetscReal weight = r.weight[i] / r.stage.slope;
+      Mat with = A_, without = A0_;
+      if (r.stage.multistep) {
+        PetscCall(trajectory_.state(r.past[i], past_));
+        PetscCall(model_.jacobian(r.time, past_, zero_, r.stage.slope, B_));
+        PetscCall(model_.jacobian(r.time, past_, zero_, 0, B0_));
+        with = B_;
+        without = B0_;
+      }
       PetscCall(VecZeroEntries(last_));
-      PetscCall(DMLocalToGlobal(model_.dm(), direction, INSERT_VALUES, last_));
-      PetscCall(MatMult(A, last_, other_));
+      PetscCall(DMLocalToGlobal(model_.dm(), of_[static_cast<std::size_t>(r.past[i])].state, INSERT_VALUES, last_));
+      PetscCall(MatMult(with, last_, other_));
       PetscCall(VecAXPY(right, -weight, other_));
-      PetscCall(MatMult(A0, last_, other_));
+      PetscCall(MatMult(without, last_, other_));
       PetscCall(VecAXPY(right, weight, other_));
-      if (!r.stage.multistep) continue;
-      // of the gas the kernels see the rate at the state of the stage, and the scheme knows the one before
-      PetscCall(trajectory_.state(r.past[i], past_));
-      PetscCall(add_gas_change(r.time, past_, direction, -r.weight[i] * scale, right));
-      PetscCall(add_gas_change(r.time, x_, direction, r.weight[i] * scale, right));
     }
-    PetscCall(model_.set_step(r.stage, r.airway.pressure, r.airway.flow));
     PetscFunctionReturn(PETSC_SUCCESS);
   }
   std::vector<PetscReal> values(const StageRecord &r) const
@@ -369,7 +340,7 @@ private:
   std::optional<AirwayResistance> tube_;
   VecHandle local_F_, x_, x_t_, past_, moved_, moved_t_, zero_; ///< local
   VecHandle last_, by_parameter_, by_past_, F_, right_, other_; ///< global
-  MatHandle A_, A0_, closed_;
+  MatHandle A_, A0_, B_, B0_, closed_;
   std::vector<Values> changes_;    ///< [stage]: of what is remembered; empty where nothing is
   std::vector<Change> of_;         ///< [stage]
   std::vector<PetscReal> volumes_; ///< [stage], mm^3
@@ -387,8 +358,7 @@ PetscErrorCode Tangent::setup()
   }
   for (VecHandle *v : {&last_, &by_parameter_, &by_past_, &F_, &right_, &other_})
     PetscCall(DMCreateGlobalVector(dm, v->out()));
-  PetscCall(model_.create_matrix(A_.out()));
-  PetscCall(model_.create_matrix(A0_.out()));
+  for (MatHandle *matrix : {&A_, &A0_, &B_, &B0_}) PetscCall(model_.create_matrix(matrix->out()));
   changes_.assign(stages, {});
   of_.resize(stages);
   for (std::size_t n = 0; n < stages; ++n) {
@@ -442,9 +412,9 @@ PetscErrorCode Tangent::step(std::size_t n, PetscReal &flow)
   model_.airway().hold(false);
   PetscCall(model_.jacobian(r.time, x_, x_t_, slope, A_));
   PetscCall(model_.jacobian(r.time, x_, x_t_, 0, A0_));
-  model_.airway().hold(!free);
   PetscCall(VecZeroEntries(right_));
-  PetscCall(add_past(r, A_, A0_, right_));
+  PetscCall(add_past(r, right_));
+  model_.airway().hold(!free);
   PetscCall(VecAXPY(right_, -1, by_parameter_));
   PetscCall(VecAXPY(right_, -1, by_past_));
   PetscCall(MatDuplicate(A_, MAT_COPY_VALUES, closed_.out()));
