@@ -176,24 +176,29 @@ PetscErrorCode ErrorParts::add_time(const Sweep &sweep, const Sweep::Solved &sta
   bool rough;
   const auto changes = better_rate(stage.number, rough);
   PetscReal flow = 0;
-  std::vector<PetscReal> before, after;
+  std::vector<PetscReal> before, after, rates(1 + model_.composition().n_scalars(), 0); // rates: of scalars
   ByCell parts;
 
   PetscFunctionBeginUser;
   if (rough) PetscCall(total(time_, before));
   for (const auto &[number, weight] : changes) {
     flow += weight * sweep.volume(number);
+    for (std::size_t j = 0; j < sweep.scalars(number).size(); ++j) rates[j] += weight * sweep.scalars(number)[j];
     if (!gas_) continue;
     PetscCall(trajectory_.state(number, state_));
     PetscCall(model_.weighted_volume(state_, stage.adjoint, parts));
     add(weight * model_.row_scale(pressure), parts, time_);
   }
-  for (std::size_t k = 0; k < lacking_.size(); ++k) lacking_[k].steps += stage.by_flow[k] * flow;
+  std::vector<PetscReal> at_airway;
+  for (std::size_t k = 0; k < lacking_.size(); ++k) {
+    at_airway.push_back(stage.by_flow[k] * flow);
+    for (std::size_t j = 0; j < rates.size(); ++j) at_airway[k] += stage.by_rate[k][j] * rates[j];
+    lacking_[k].steps += at_airway[k];
+  }
   if (sweep.other_rates()) PetscCall(add_other_rates(stage, changes));
   if (!rough) PetscFunctionReturn(PETSC_SUCCESS);
   PetscCall(total(time_, after));
-  for (std::size_t k = 0; k < lacking_.size(); ++k)
-    rough_[k] += std::abs(after[k] - before[k] + stage.by_flow[k] * flow);
+  for (std::size_t k = 0; k < lacking_.size(); ++k) rough_[k] += std::abs(after[k] - before[k] + at_airway[k]);
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -309,8 +314,8 @@ PetscErrorCode ErrorParts::visit(const Sweep &sweep, const Sweep::Solved &stage)
   PetscFunctionBeginUser;
   PetscCall(model_.set_step(record.stage, record.airway.pressure, record.airway.flow));
   if (!flow_) PetscCall(add_solver(stage));
-  for (std::size_t k = 0; k < lacking_.size(); ++k)
-    lacking_[k].solver += stage.opening[k] * sweep.left_at_opening(stage);
+  const std::vector<PetscReal> of_scalars = sweep.weighted_scalars(stage);
+  for (std::size_t k = 0; k < lacking_.size(); ++k) lacking_[k].solver += of_scalars[k];
   PetscCall(add_time(sweep, stage));
   PetscCall(add_space(stage));
   PetscFunctionReturn(PETSC_SUCCESS);

@@ -23,10 +23,14 @@ constexpr PetscReal hidden = 1e-13;
 /// rounding would count. It is moved both ways then.
 constexpr PetscReal larger_difference = 1e-6;
 
-/// A parameter of the scene: of kernels, or of the ventilator.
+/// Who reads a parameter of the scene.
+enum class Reader { kernels, ventilator, scalars, tube };
+
+/// A parameter of the scene.
 struct Parameter {
   Options::RealOption option;
-  std::vector<PetscInt> places;  ///< among the constants of kernels (Composition::constant_at); none: the ventilator's
+  Reader reader = Reader::ventilator;
+  std::vector<PetscInt> places;  ///< among the constants of kernels (constant_at()); none: they read it in place
   bool on_facets = false;        ///< nothing in the volume reads it
   bool varies = false;           ///< it differs from place to place
   PetscReal size = 0;            ///< of its values, wherever they are
@@ -34,8 +38,20 @@ struct Parameter {
   PetscReal effect = 0;          ///< the largest share of the residual that this changes
   std::vector<Phase> less, more; ///< the ventilator's phases with less and more of it
   bool adds_up = false;          ///< an effect reads it that remembers
+  AirwayResistance less_tube, more_tube; ///< the same of the tube
   PetscReal change() const { return share * size; }
 };
+
+/// What @p read gives with a setting changed by @p change.
+template <class Read>
+auto with_changed(const Options::RealOption &option, PetscReal change, Read &&read)
+{
+  const PetscReal value = *option.target;
+  *option.target = value + change;
+  auto result = read();
+  *option.target = value;
+  return result;
+}
 
 /// The share of a parameter to move it by: rounding of the residual and the curvature over it then spoil the quotient
 /// alike. @p effect: of the residual, that a move by @p share changes.
@@ -49,16 +65,26 @@ PetscReal best_share(PetscReal share, PetscReal effect)
 /// The phases of the ventilator with setting @p option changed by @p change.
 std::vector<Phase> phases_with(const SceneFacts &facts, const Options::RealOption &option, PetscReal change)
 {
-  const PetscReal value = *option.target;
-  const auto laid_out = [&] {
+  return with_changed(option, change, [&] {
     auto phases = facts.programme_again(false).phases();
     if (phases.size() < facts.ventilator->phases().size()) phases = facts.programme_again(true).phases();
     return phases;
-  };
-  *option.target = value + change;
-  std::vector<Phase> phases = laid_out();
-  *option.target = value;
-  return phases;
+  });
+}
+
+/// Finds out whether the tube reads a parameter, or the equations of scalars.
+bool is_of_airways(const SceneFacts &facts, const Composition &composition, Parameter &p)
+{
+  if (composition.read_by_scalars(p.option.target)) {
+    p.reader = Reader::scalars;
+    p.share = larger_difference;
+  } else if (facts.tube_again) {
+    p.less_tube = with_changed(p.option, -p.change(), facts.tube_again);
+    p.more_tube = with_changed(p.option, p.change(), facts.tube_again);
+    if (p.less_tube.linear != p.more_tube.linear || p.less_tube.quadratic != p.more_tube.quadratic)
+      p.reader = Reader::tube;
+  }
+  return p.reader != Reader::ventilator;
 }
 
 /// Whether two lists of phases differ in nothing but in what they prescribe.
@@ -137,17 +163,23 @@ PetscErrorCode find_parameters(const Options &options, const Scene &scene, const
       p.on_facets = p.on_facets && composition.read_on_surfaces_alone(owner);
       p.adds_up = p.adds_up || composition.remembers(owner);
     }
+    const char *const in_place = composition.reader_in_place(option.target);
+    if (in_place) { // what else reads it may remember
+      p.adds_up = composition.memory_acts();
+      p.on_facets = p.on_facets && !p.adds_up && composition.read_on_surfaces_alone(in_place);
+    }
+    if (in_place || !p.places.empty()) p.reader = Reader::kernels;
     if (p.adds_up) p.share = larger_difference;
     PetscCall(size_of(options.comm(), composition, p, p.size));
     if (p.size == 0) {
       leave_out("it is zero", true);
       continue;
     }
-    if (composition.varying() && !p.places.empty() && !composition.derived().empty()) {
+    if (composition.varying() && p.reader == Reader::kernels && !composition.derived().empty()) {
       leave_out("parameters differ from place to place, and -prestress makes others of them");
       continue;
     }
-    if (p.places.empty()) {
+    if (p.reader != Reader::kernels && !is_of_airways(facts, composition, p)) {
       p.less = phases_with(facts, option, -p.change());
       p.more = phases_with(facts, option, p.change());
       if (!same_times(p.less, p.more)) {
@@ -155,14 +187,40 @@ PetscErrorCode find_parameters(const Options &options, const Scene &scene, const
         continue;
       }
       if (same_targets(p.less, p.more)) {
-        if (option.option.rfind("-ventilator_", 0) != 0)
-          leave_out("no point of the mesh reads it"); // else no phase does
+        if (option.option.rfind("-ventilator_", 0) != 0) leave_out("no equation reads it"); // else no phase does
         continue;
       }
     }
     list.push_back(std::move(p));
   }
   PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Adds the derivatives by a parameter of the equations of a stage that no kernel is part of, times their multipliers,
+/// by number.
+void add_outside_kernels(const Sweep &sweep, const Sweep::Solved &stage, const Parameter &p, std::vector<double> &sums)
+{
+  const PetscReal Q = sweep.flow(stage.number), change = 2 * p.change();
+  std::vector<PetscReal> by, less;
+  PetscReal factor = 0;
+  switch (p.reader) {
+  case Reader::kernels:
+    return;
+  case Reader::ventilator:
+    by = stage.by_target;
+    factor = (target(stage.record, p.more) - target(stage.record, p.less)) / change;
+    break;
+  case Reader::tube:
+    by = stage.by_drop;
+    factor = (p.more_tube.drop(Q) - p.less_tube.drop(Q)) / change;
+    break;
+  case Reader::scalars:
+    less = with_changed(p.option, -p.change(), [&] { return sweep.weighted_scalars(stage); });
+    by = with_changed(p.option, p.change(), [&] { return sweep.weighted_scalars(stage); });
+    for (std::size_t k = 0; k < by.size(); ++k) by[k] -= less[k];
+    factor = 1 / change;
+  }
+  for (std::size_t k = 0; k < by.size(); ++k) sums[k] += by[k] * factor;
 }
 
 using ByCell = std::vector<std::vector<PetscReal>>; ///< [number][cell of this rank]
@@ -261,11 +319,11 @@ PetscErrorCode add_derivatives(const Options &options, const Scene &scene, Model
     PetscCall(residual(true, on_facets));
     for (std::size_t i = 0; i < parameters.size(); ++i) {
       Parameter &p = parameters[i];
-      if (p.places.empty()) continue;
+      if (p.reader != Reader::kernels) continue;
       const auto residual_with = [&](PetscReal by, ByCell &sums) -> PetscErrorCode {
         PetscFunctionBeginUser;
-        model.change_parameter(p.places, by);
-        PetscCall(residual(p.on_facets, sums));
+        if (!p.places.empty()) model.change_parameter(p.places, by);
+        PetscCall(with_changed(p.option, p.places.empty() ? by : 0, [&] { return residual(p.on_facets, sums); }));
         model.change_parameter({}, 0);
         PetscFunctionReturn(PETSC_SUCCESS);
       };
@@ -296,12 +354,8 @@ PetscErrorCode add_derivatives(const Options &options, const Scene &scene, Model
   sweep.ask_targets();
   const auto visit = [&](const Sweep::Solved &stage) -> PetscErrorCode {
     PetscFunctionBeginUser;
-    for (std::size_t i = 0; i < parameters.size() && rank == 0; ++i) {
-      const Parameter &p = parameters[i];
-      if (!p.places.empty()) continue;
-      const PetscReal by_parameter = (target(stage.record, p.more) - target(stage.record, p.less)) / (2 * p.change());
-      for (std::size_t k = 0; k < count; ++k) report.parameters[i].derivative[k] += stage.by_target[k] * by_parameter;
-    }
+    for (std::size_t i = 0; i < parameters.size() && rank == 0; ++i)
+      add_outside_kernels(sweep, stage, parameters[i], report.parameters[i].derivative);
     PetscCall(
         move_parameters(true, [&](bool facets, ByCell &sums) { return sweep.weighted_residual(stage, facets, sums); }));
     PetscFunctionReturn(PETSC_SUCCESS);
@@ -316,7 +370,7 @@ PetscErrorCode add_derivatives(const Options &options, const Scene &scene, Model
       for (const PetscReal part : by_cell[i][k]) row.derivative[k] += part;
     PetscCall(sum_up(options.comm(), row.derivative));
     for (const Mesh::Region &region : regions) {
-      if (parameters[i].places.empty()) break;
+      if (parameters[i].reader != Reader::kernels) break;
       std::vector<double> sums(count, 0);
       for (std::size_t k = 0; k < count; ++k)
         for (const PetscInt c : region.cells) sums[k] += by_cell[i][k][static_cast<std::size_t>(c)];
@@ -326,7 +380,8 @@ PetscErrorCode add_derivatives(const Options &options, const Scene &scene, Model
     if (!parameters[i].places.empty()) row.by_cell = std::move(by_cell[i]);
   }
   for (std::size_t i = parameters.size(); i-- > 0;) {
-    if (parameters[i].places.empty() || parameters[i].effect == 0 || parameters[i].effect >= hidden) continue;
+    if (parameters[i].reader != Reader::kernels || parameters[i].effect == 0 || parameters[i].effect >= hidden)
+      continue;
     report.left_out.push_back({parameters[i].option.option, "it is so small that rounding hides what it does", false});
     report.parameters.erase(report.parameters.begin() + static_cast<std::ptrdiff_t>(i));
   }

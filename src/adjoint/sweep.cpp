@@ -28,8 +28,6 @@ std::string Sweep::obstacle(const Scene &scene, const Model &model)
   const Composition &composition = model.composition();
   if (!model.own_integration()) return "needs pulmo's own integration: leave -petscfe_type out";
   if (const std::string of_memory = MemorySweep::obstacle(composition); !of_memory.empty()) return of_memory;
-  if (composition.n_scalars() > 0)
-    return "does not know yet the unknowns of -" + composition.scalar_groups().front().effect;
   if (!scene.facts().ventilator) return "is about the numbers of a breath: it needs -ventilator";
   return "";
 }
@@ -51,8 +49,18 @@ PetscErrorCode Sweep::setup(const std::vector<Functional> &functionals)
   if (model_.composition().memory_acts()) memory_ = std::make_unique<MemorySweep>(model_);
   PetscCall(DMGetNumFields(model_.dm(), &fields));
   gas_ = fields > pressure;
-  for (VecHandle *v : {&x_, &rate_, &past_, &column_, &border_, &work_, &other_}) PetscCall(create(*v));
-  for (VecHandle *v : {&right_, &held_, &product_, &residual_}) PetscCall(DMCreateGlobalVector(model_.dm(), v->out()));
+  storages_ = scalars_.storages();
+  acting_ = scalars_.of_effects() ? model_.airway().acting() : std::vector<std::size_t>{0};
+  columns_.resize(acting_.size());
+  fluxes_.resize(scalars_.of_effects() ? acting_.size() : 0); // without these no equation sees a flux
+  for (VecHandle *v : {&x_, &rate_, &past_, &work_, &other_, &volume_.z}) PetscCall(create(*v));
+  for (VecHandle &column : columns_) PetscCall(create(column));
+  for (VecHandle *v : {&right_, &held_, &product_, &residual_, &volume_.right})
+    PetscCall(DMCreateGlobalVector(model_.dm(), v->out()));
+  for (Border &border : fluxes_) {
+    PetscCall(create(border.z));
+    PetscCall(VecDuplicate(right_, border.right.out()));
+  }
   count_ = functionals.size();
   parts_.assign(count_, {});
   PetscCall(scene_.mesh().regions(regions));
@@ -66,7 +74,7 @@ PetscErrorCode Sweep::setup(const std::vector<Functional> &functionals)
     if (row < 0) continue;
     const SignalRow &r = simulation_.rows()[static_cast<std::size_t>(row)];
     volumes_[i] = r.volume * units::mm3_per_ml;
-    flows_[i] = r.flow * units::mm3_per_ml;
+    flows_[i] = (r.flow + r.stored_flow) * units::mm3_per_ml;
   }
   for (std::size_t i = 0; i < volumes_.size(); ++i) { // of a half step no row tells
     if (trajectory_.stages()[i].row >= 0) continue;
@@ -74,6 +82,7 @@ PetscErrorCode Sweep::setup(const std::vector<Functional> &functionals)
     PetscCall(trajectory_.state(static_cast<PetscInt>(i), x_));
     PetscCall(model_.measure(x_, measures));
     volumes_[i] = measures.volume_change;
+    flows_[i] = gas_rate(trajectory_.stages()[i], static_cast<PetscInt>(i));
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -81,15 +90,22 @@ PetscErrorCode Sweep::setup(const std::vector<Functional> &functionals)
 Sweep::Wanted &Sweep::wanted(Pending &pending, PetscInt stage, std::size_t functional) const
 {
   std::vector<Wanted> &all = pending[stage];
-  all.resize(count_);
+  if (all.empty()) {
+    all.resize(count_);
+    for (Wanted &one : all) one.scalars.resize(storages_.size(), 0);
+  }
   return all[functional];
 }
 
 void Sweep::want_ventilator_pressure(PetscInt stage, PetscReal derivative, Wanted &wanted) const
 {
   const auto &tube = scene_.facts().tube;
-  wanted.pressure += derivative;
-  if (tube) wanted.flow += derivative * tube->slope(flows_[static_cast<std::size_t>(stage)]);
+  wanted.scalars[0] += derivative;
+  if (!tube) return;
+  const PetscReal by_flow = derivative * tube->slope(flow(stage));
+  wanted.drop += derivative;
+  wanted.flow += by_flow;
+  wanted.stored += by_flow;
 }
 
 PetscErrorCode Sweep::recall(const StageRecord &record, PetscInt number)
@@ -116,7 +132,7 @@ PetscErrorCode Sweep::recall(const StageRecord &record, PetscInt number)
 
 /// The residual is linear in both, so that a difference over any step is exact; but what is remembered may follow from
 /// the pressure as it likes.
-PetscErrorCode Sweep::make_column(const StageRecord &record)
+PetscErrorCode Sweep::make_column(const StageRecord &record, std::size_t scalar, Vec column)
 {
   const bool free = record.airway.mode == Airway::Mode::free;
   const PetscReal L = model_.composition().mesh().length(),
@@ -128,20 +144,44 @@ PetscErrorCode Sweep::make_column(const StageRecord &record)
     PetscCall(VecCopy(x_, past_));
     PetscCall(VecCopy(rate_, other_));
     if (!free && gas_) {
-      PetscCall(model_.airway().fill(past_, record.airway.pressure + by));
+      std::vector<PetscReal> values = values_of(record), rates(values.size(), 0);
+      values[scalar] += by;
+      rates[scalar] = by * record.stage.slope;
+      PetscCall(model_.airway().fill(past_, values));
       PetscCall(VecZeroEntries(work_));
-      PetscCall(model_.airway().fill(work_, by * record.stage.slope));
+      PetscCall(model_.airway().fill(work_, rates));
       PetscCall(VecAXPY(other_, 1, work_));
     }
-    PetscCall(
-        model_.set_step(record.stage, record.airway.pressure + (free ? 0 : by), record.airway.flow + (free ? by : 0)));
+    PetscCall(model_.set_step(record.stage, record.airway.pressure + (free || scalar > 0 ? 0 : by),
+                              record.airway.flow + (free ? by : 0)));
     PetscCall(model_.residual(record.time, past_, other_, F));
     PetscFunctionReturn(PETSC_SUCCESS);
   };
-  PetscCall(residual_at(change, column_));
+  PetscCall(residual_at(change, column));
   PetscCall(residual_at(-change, work_));
-  PetscCall(VecAXPBY(column_, -1 / (2 * change), 1 / (2 * change), work_));
+  PetscCall(VecAXPBY(column, -1 / (2 * change), 1 / (2 * change), work_));
   PetscCall(model_.set_step(record.stage, record.airway.pressure, record.airway.flow));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Sweep::make_columns(const StageRecord &record)
+{
+  const bool wanted = targets_ || record.airway.mode != Airway::Mode::held || record.airway.by_start != 0;
+
+  PetscFunctionBeginUser;
+  for (std::size_t a = 0; a < acting_.size(); ++a)
+    if (wanted)
+      PetscCall(make_column(record, acting_[a], columns_[a]));
+    else
+      PetscCall(VecZeroEntries(columns_[a]));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Sweep::along_columns(Vec z, std::vector<PetscReal> &by_scalar) const
+{
+  PetscFunctionBeginUser;
+  by_scalar.assign(storages_.size(), 0);
+  for (std::size_t a = 0; a < acting_.size(); ++a) PetscCall(dot(z, columns_[a], by_scalar[acting_[a]]));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -268,7 +308,7 @@ PetscErrorCode Sweep::want_by_memory(const StageRecord &record, std::vector<Want
   PetscCall(memory_->by_state(record.time, x_, rate_, numbers));
   for (std::size_t k = 0; k < count_; ++k) {
     if (want[k].memory.empty()) continue;
-    want[k].pressure += numbers[k].by_pressure;
+    want[k].scalars[0] += numbers[k].by_pressure;
     for (int i = 0; i < 2; ++i) {
       if (record.past[i] < 0) continue;
       Wanted &before = wanted(pending, record.past[i], k);
@@ -333,10 +373,15 @@ PetscErrorCode Sweep::make_shifts(PetscInt stage, const Pending &pending)
     if (shift->stage != stage) continue;
     shift->change.assign(count_, 0);
     if (found == pending.end()) continue;
-    const auto of = [&](PetscInt n) -> const StageRecord & {
+    const auto record = [&](PetscInt n) -> const StageRecord & {
       return trajectory_.stages()[static_cast<std::size_t>(n)];
     };
-    const auto from = static_cast<std::size_t>(shift->from), to = static_cast<std::size_t>(shift->to);
+    const auto row = [&](PetscInt n) -> const SignalRow & {
+      return simulation_.rows()[static_cast<std::size_t>(record(n).row)];
+    };
+    const std::vector<PetscReal> from = values_of(record(shift->from)), to = values_of(record(shift->to));
+    const PetscReal flow = units::mm3_per_ml * (row(shift->to).flow - row(shift->from).flow),
+                    stored = units::mm3_per_ml * (row(shift->to).stored_flow - row(shift->from).stored_flow);
     MemorySweep::Values before, after;
     PetscCall(trajectory_.state(shift->from, past_));
     PetscCall(trajectory_.state(shift->to, other_));
@@ -351,8 +396,8 @@ PetscErrorCode Sweep::make_shifts(PetscInt stage, const Pending &pending)
       if (w.state) PetscCall(VecDot(w.state, other_, &by_state));
       for (std::size_t i = 0; i < w.memory.size(); ++i) by_state += w.memory[i] * (after[i] - before[i]);
       PetscCallMPI(MPI_Allreduce(&by_state, &sum, 1, MPIU_REAL, MPI_SUM, PetscObjectComm((PetscObject)model_.dm())));
-      shift->change[k] = sum + w.volume * (volumes_[to] - volumes_[from]) + w.flow * (flows_[to] - flows_[from]) +
-                         w.pressure * (of(shift->to).airway.pressure - of(shift->from).airway.pressure);
+      for (std::size_t i = 0; i < w.scalars.size(); ++i) sum += w.scalars[i] * (to[i] - from[i]);
+      shift->change[k] = sum + w.volume * (volume(shift->to) - volume(shift->from)) + w.flow * flow + w.stored * stored;
     }
   }
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -384,10 +429,7 @@ PetscErrorCode Sweep::assemble(const StageRecord &record, PetscInt number)
 
   PetscFunctionBeginUser;
   PetscCall(recall(record, number));
-  if (targets_ || record.airway.mode != Airway::Mode::held || record.airway.by_start != 0)
-    PetscCall(make_column(record));
-  else
-    PetscCall(VecZeroEntries(column_));
+  PetscCall(make_columns(record));
   PetscCall(model_.transposed_jacobian(record.time, x_, rate_, record.stage.slope, matrix));
   PetscCall(KSPSetOperators(ksp_, matrix, matrix));
   // a preconditioner is kept as long as that of a Jacobian is, for stages of one kind, unless it alone has to solve
@@ -415,7 +457,7 @@ PetscErrorCode Sweep::right_side(const StageRecord &record, std::size_t k, Wante
   if (w.state) PetscCall(VecCopy(w.state, work_));
   if (w.volume != 0) PetscCall(model_.add_volume_gradient(x_, nullptr, w.volume, work_));
   if (w.part != 0) PetscCall(model_.add_volume_gradient(x_, nullptr, w.part, work_, &parts_[k]));
-  if (free) PetscCall(model_.airway().add_mean_gradient(w.pressure, work_));
+  if (free) PetscCall(model_.airway().add_mean_gradient(w.scalars[0], work_));
   PetscCall(to_global(work_, right));
   if (gas_ && !free && w.flow != 0) {
     PetscCall(VecZeroEntries(held_));
@@ -427,33 +469,58 @@ PetscErrorCode Sweep::right_side(const StageRecord &record, std::size_t k, Wante
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscReal Sweep::volume_rate(const StageRecord &record, PetscInt number) const
+PetscReal Sweep::gas_rate(const StageRecord &record, PetscInt number) const
 {
-  PetscReal Q = record.stage.slope * volume(number);
+  PetscReal Q = record.stage.slope * volume(number), beside = record.stage.slope * scalars_.stored(scalars(number));
+  for (int i = 0; i < 2; ++i) {
+    if (record.past[i] < 0) continue;
+    Q += record.weight[i] * volume(record.past[i]);
+    beside += record.weight[i] * scalars_.stored(scalars(record.past[i]));
+  }
+  return Q + beside;
+}
+
+ScalarUnknowns::OpeningEquation Sweep::equation(const StageRecord &record, PetscInt number) const
+{
+  return [&record, this, rate = gas_rate(record, number)](PetscReal P, PetscReal gas) {
+    return Airway::equation(model_, scene_.facts().tube, record.airway.control, record.airway.target,
+                            record.stage.slope, P, gas, rate);
+  };
+}
+
+std::vector<PetscReal> Sweep::values_of(const StageRecord &record) const
+{
+  return scalars_.of_effects() ? record.airway.scalars : std::vector<PetscReal>{record.airway.pressure};
+}
+
+PetscErrorCode Sweep::recall_scalars(const StageRecord &record, PetscInt number)
+{
+  std::vector<PetscReal> past(storages_.size(), 0);
+
+  PetscFunctionBeginUser;
   for (int i = 0; i < 2; ++i)
-    if (record.past[i] >= 0) Q += record.weight[i] * volume(record.past[i]);
-  return Q;
+    for (std::size_t j = 0; scalars_.of_effects() && record.past[i] >= 0 && j < past.size(); ++j)
+      past[j] += record.weight[i] * scalars(record.past[i])[j];
+  scalars_.begin(values_of(record), true, record.stage.slope, past);
+  scalars_.recall(volume(number), record.airway.flows);
+  rows_ = scalars_.rows(equation(record, number));
+  PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscReal Sweep::left_at_opening(const Solved &stage) const
+std::vector<PetscReal> Sweep::weighted_scalars(const Solved &stage) const
 {
-  const Airway::Condition &airway = stage.record.airway;
-  const PetscReal L = model_.composition().mesh().length();
-  const auto &tube = scene_.facts().tube;
-  if (airway.mode != Airway::Mode::solved) return 0;
-  if (airway.control == Control::flow) return (volume(stage.number) - airway.target) / (L * L * L);
-  const PetscReal drop = tube ? tube->drop(volume_rate(stage.record, stage.number)) : 0;
-  return (airway.pressure + drop - airway.target) / model_.modulus();
+  std::vector<PetscReal> sums(count_, 0);
+  if (stage.record.airway.mode != Airway::Mode::solved) return sums;
+  const ScalarUnknowns::Rows rows = scalars_.rows(equation(stage.record, stage.number));
+  for (std::size_t k = 0; k < count_; ++k)
+    for (std::size_t i = 0; i < rows.c.size(); ++i) sums[k] += stage.multipliers[k][i] * rows.c[i];
+  return sums;
 }
 
-/// Derivatives of the equation c(P, V) = 0 of the pressure at the opening (Airway::equation).
-Sweep::Opening Sweep::opening(const StageRecord &record, PetscInt number) const
+void Sweep::want_gas(PetscReal derivative, Wanted &wanted) const
 {
-  const PetscReal L = model_.composition().mesh().length(), h3 = L * L * L, modulus = model_.modulus();
-  const auto &tube = scene_.facts().tube;
-  if (record.airway.control == Control::flow) return {0, 1 / h3, 0, -1 / h3};
-  const PetscReal by_flow = tube ? tube->slope(volume_rate(record, number)) / modulus : 0;
-  return {1 / modulus, by_flow * record.stage.slope, by_flow, -1 / modulus};
+  wanted.volume += derivative;
+  for (std::size_t j = 0; j < storages_.size(); ++j) wanted.scalars[j] += derivative * storages_[j];
 }
 
 void Sweep::want_past_volumes(const StageRecord &record, PetscReal by_flow, std::size_t k, Pending &pending) const
@@ -462,65 +529,154 @@ void Sweep::want_past_volumes(const StageRecord &record, PetscReal by_flow, std:
     if (record.past[i] >= 0) wanted(pending, record.past[i], k).volume += by_flow * record.weight[i];
 }
 
-/// Solves for what one unit of the multiplier of c adds to z.
-PetscErrorCode Sweep::solve_border(const Opening &c, std::string &failure)
+PetscErrorCode Sweep::begin_borders()
 {
+  const std::size_t n = storages_.size();
+
   PetscFunctionBeginUser;
-  PetscCall(VecZeroEntries(work_));
-  PetscCall(model_.add_volume_gradient(x_, nullptr, -c.by_volume, work_));
-  PetscCall(to_global(work_, right_));
-  PetscCall(model_.airway().set(right_, 0));
-  PetscCall(solve(right_, product_, failure));
-  PetscCall(to_local(product_, border_));
-  PetscCall(dot(border_, column_, border_column_));
+  volume_.seen = rows_.by_volume[0] != 0;
+  if (volume_.seen) {
+    PetscCall(VecZeroEntries(work_));
+    PetscCall(model_.add_volume_gradient(x_, nullptr, -rows_.by_volume[0], work_));
+    PetscCall(to_global(work_, volume_.right));
+  }
+  for (std::size_t a = 0; a < fluxes_.size(); ++a) {
+    Border &border = fluxes_[a];
+    std::vector<PetscReal> unit(n, 0);
+    unit[acting_[a]] = 1 / model_.row_scale(pressure);
+    border.seen = false;
+    for (std::size_t i = 0; i < n; ++i) border.seen = border.seen || rows_.by_flow[i * n + acting_[a]] != 0;
+    if (!border.seen) continue;
+    PetscCall(VecZeroEntries(held_));
+    PetscCall(model_.airway().fill_global(held_, unit));
+    PetscCall(MatMult(simulation_.matrix(), held_, border.right));
+    PetscCall(VecScale(border.right, -1));
+    PetscCall(VecZeroEntries(border.z));
+    PetscCall(model_.airway().fill(border.z, unit));
+  }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode Sweep::solve_borders(std::string &failure)
+{
+  PetscFunctionBeginUser;
+  const auto solve_one = [&](Border &border, bool at_nodes) -> PetscErrorCode {
+    PetscFunctionBeginUser;
+    border.by_scalar.assign(storages_.size(), 0);
+    if (!border.seen) PetscFunctionReturn(PETSC_SUCCESS);
+    PetscCall(model_.airway().set(border.right, 0));
+    PetscCall(solve(border.right, product_, failure));
+    PetscCall(to_local(product_, at_nodes ? work_ : border.z));
+    if (at_nodes) PetscCall(VecAXPY(border.z, 1, work_));
+    PetscCall(along_columns(border.z, border.by_scalar));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  };
+  PetscCall(solve_one(volume_, false));
+  for (Border &border : fluxes_) PetscCall(solve_one(border, true));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+std::vector<PetscReal> Sweep::solve_scalars(const std::vector<PetscReal> &wanted) const
+{
+  const std::size_t n = wanted.size();
+  std::vector<PetscReal> system(n * n), multipliers(n);
+  for (std::size_t j = 0; j < n; ++j) {
+    multipliers[j] = -wanted[j];
+    for (std::size_t i = 0; i < n; ++i) {
+      PetscReal &entry = system[j * n + i] = rows_.by_scalar[i * n + j];
+      if (i == 0) entry += volume_.by_scalar[j];
+      for (std::size_t a = 0; a < fluxes_.size(); ++a)
+        entry += rows_.by_flow[i * n + acting_[a]] * fluxes_[a].by_scalar[j];
+    }
+  }
+  solve_dense(std::move(system), multipliers);
+  return multipliers;
+}
+
+/// Adds the multipliers of the scalars' equations to what is solved for number @p k.
+PetscErrorCode Sweep::add_scalars(const StageRecord &record, std::size_t k, const std::vector<PetscReal> &wanted,
+                                  Solved &result, std::string &failure)
+{
+  const std::size_t n = wanted.size();
+  const std::vector<PetscReal> m = solve_scalars(wanted);
+
+  PetscFunctionBeginUser;
+  if (!std::all_of(m.begin(), m.end(), [](PetscReal one) { return std::isfinite(one); }))
+    failure = "the equations of the airway's pressures leave these open in a step of the sweep";
+  if (volume_.seen) PetscCall(VecAXPY(result.adjoint[k], m[0], volume_.z));
+  for (std::size_t a = 0; a < fluxes_.size(); ++a) {
+    PetscReal by_flux = 0;
+    for (std::size_t i = 0; i < n; ++i) by_flux += m[i] * rows_.by_flow[i * n + acting_[a]];
+    if (fluxes_[a].seen) PetscCall(VecAXPY(result.adjoint[k], by_flux, fluxes_[a].z));
+  }
+  result.multipliers[k] = m;
+  result.by_volume[k] += m[0] * rows_.by_volume[0];
+  result.by_flow[k] += m[0] * rows_.opening.by_flow;
+  result.by_target[k] = m[0] * rows_.opening.by_target;
+  if (record.airway.control != Control::flow) result.by_drop[k] -= result.by_target[k];
+  for (std::size_t j = 0; j < n; ++j) {
+    result.by_rate[k][j] += m[0] * rows_.opening.by_flow * storages_[j];
+    for (std::size_t i = 0; i < n; ++i) result.by_rate[k][j] += m[i] * rows_.by_rate[i * n + j];
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+void Sweep::look_back_at_scalars(const StageRecord &record, std::size_t k, const Solved &result, Pending &pending)
+{
+  const Airway::Condition &airway = record.airway;
+  if (airway.mode == Airway::Mode::free) want_past_volumes(record, result.by_flow[k], k, pending);
+  if (airway.mode == Airway::Mode::solved)
+    want_past_volumes(record, result.multipliers[k][0] * rows_.opening.by_flow, k, pending);
+  for (int i = 0; i < 2 && scalars_.of_effects(); ++i)
+    for (std::size_t j = 0; record.past[i] >= 0 && j < storages_.size(); ++j)
+      wanted(pending, record.past[i], k).scalars[j] += record.weight[i] * result.by_rate[k][j];
+  Wanted &start = wanted(pending, record.phase_start, k);
+  if (airway.control == Control::flow)
+    want_gas(result.by_target[k] * airway.by_start, start);
+  else
+    want_ventilator_pressure(record.phase_start, result.by_target[k] * airway.by_start, start);
+}
+
 /// Solves for z of number @p k, and adds what that wants of earlier stages.
-PetscErrorCode Sweep::solve_stage(const StageRecord &record, const Opening &c, std::size_t k, const Wanted &w,
-                                  Vec right, Pending &pending, Solved &result, std::string &failure)
+PetscErrorCode Sweep::solve_stage(const StageRecord &record, std::size_t k, const Wanted &w, Vec right,
+                                  Pending &pending, Solved &result, std::string &failure)
 {
   const Vec z = result.adjoint[k];
-  PetscReal &target = result.by_target[k];
   const Airway::Condition &airway = record.airway;
   const bool free = airway.mode == Airway::Mode::free, held = gas_ && !free;
-  PetscReal by_column, at_nodes = 0;
+  std::vector<PetscReal> by_columns, at_nodes, by_scalar = w.scalars;
 
   PetscFunctionBeginUser;
   if (!free) PetscCall(model_.airway().set(right, 0));
   PetscCall(solve(right, product_, failure));
   PetscCall(to_local(product_, z));
   if (held) PetscCall(model_.airway().fill(z, w.flow / model_.row_scale(pressure)));
-  PetscCall(dot(z, column_, by_column));
-  if (held && w.state) PetscCall(model_.airway().sum(w.state, at_nodes));
-  const PetscReal by_pressure = w.pressure + at_nodes + by_column;
+  PetscCall(along_columns(z, by_columns));
+  if (held && w.state) {
+    PetscCall(model_.airway().sum(w.state, at_nodes));
+    for (std::size_t j = 0; j < by_scalar.size(); ++j) by_scalar[j] += at_nodes[j];
+  }
   result.by_volume[k] = w.volume;
   result.by_flow[k] = gas_ ? 0 : w.flow;
+  result.by_drop[k] = w.drop;
+  for (std::size_t j = 0; j < storages_.size(); ++j) {
+    result.by_rate[k][j] = w.stored * storages_[j];
+    by_scalar[j] += record.stage.slope * result.by_rate[k][j];
+  }
   switch (airway.mode) {
   case Airway::Mode::free:
-    result.by_mean_pressure[k] = w.pressure;
-    result.by_flow[k] = w.flow + by_column;
-    target = result.by_flow[k] * record.stage.slope;
-    want_past_volumes(record, result.by_flow[k], k, pending);
+    result.by_mean_pressure[k] = w.scalars[0];
+    result.by_flow[k] = w.flow + by_columns[0];
+    result.by_target[k] = result.by_flow[k] * record.stage.slope;
     break;
-  case Airway::Mode::solved: {
-    const PetscReal multiplier = -by_pressure / (c.by_pressure + border_column_);
-    PetscCall(VecAXPY(z, multiplier, border_));
-    result.opening[k] = multiplier;
-    result.by_volume[k] += multiplier * c.by_volume;
-    result.by_flow[k] += multiplier * c.by_flow;
-    target = multiplier * c.by_target;
-    want_past_volumes(record, multiplier * c.by_flow, k, pending);
+  case Airway::Mode::solved:
+    for (std::size_t j = 0; j < by_scalar.size(); ++j) by_scalar[j] += by_columns[j];
+    PetscCall(add_scalars(record, k, by_scalar, result, failure));
     break;
-  }
   case Airway::Mode::held:
-    target = by_pressure;
+    result.by_target[k] = by_scalar[0] + by_columns[0];
   }
-  Wanted &start = wanted(pending, record.phase_start, k);
-  if (airway.control == Control::flow)
-    start.volume += target * airway.by_start;
-  else
-    want_ventilator_pressure(record.phase_start, target * airway.by_start, start);
+  look_back_at_scalars(record, k, result, pending);
   PetscCall(look_back(record, z, k, pending));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -556,14 +712,16 @@ PetscErrorCode Sweep::run(const std::vector<Functional> &functionals, PetscReal 
     PetscCall(assemble(record, n));
     if (memory_) PetscCall(want_by_memory(record, want, pending));
     for (std::size_t k = 0; k < count_; ++k) PetscCall(right_side(record, k, want[k], pending, rights[k]));
-    PetscCall(model_.airway().close_rows(simulation_.matrix(), false));
-    Opening c;
-    if (record.airway.mode == Airway::Mode::solved) {
-      c = opening(record, n);
-      PetscCall(solve_border(c, failure));
+    const bool solved = record.airway.mode == Airway::Mode::solved;
+    if (solved) {
+      PetscCall(recall_scalars(record, n));
+      PetscCall(begin_borders());
     }
+    PetscCall(model_.airway().close_rows(simulation_.matrix(), false));
+    if (solved) PetscCall(solve_borders(failure));
     const std::vector<PetscReal> none(count_, 0);
-    Solved result{n, record, x_, rate_, {}, none, none, none, none, none, {}, {}};
+    const std::vector<std::vector<PetscReal>> of_scalars(count_, std::vector<PetscReal>(storages_.size(), 0));
+    Solved result{n, record, x_, rate_, {}, none, none, none, none, none, of_scalars, of_scalars, {}, {}};
     for (std::size_t k = 0; k < count_; ++k) {
       result.adjoint.push_back(adjoint[k]);
       result.by_memory.push_back(want[k].weights());
@@ -573,7 +731,7 @@ PetscErrorCode Sweep::run(const std::vector<Functional> &functionals, PetscReal 
       if (want[k].nothing()) // no later row of this number
         PetscCall(VecZeroEntries(adjoint[k]));
       else
-        PetscCall(solve_stage(record, c, k, want[k], rights[k], pending, result, failure));
+        PetscCall(solve_stage(record, k, want[k], rights[k], pending, result, failure));
     }
     if (memory_ && failure.empty()) PetscCall(look_back_at_memory(result, pending));
     if (visit && failure.empty()) PetscCall(visit(result));

@@ -366,21 +366,20 @@ PetscErrorCode AirwayNodes::add_mean_gradient(PetscReal factor, Vec local) const
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode AirwayNodes::fill(Vec local, PetscReal value) const
+PetscErrorCode AirwayNodes::fill(Vec local, const std::vector<PetscReal> &values) const
 {
   PetscFunctionBeginUser;
   WriteArray x(local);
-  for (const Node &node : nodes_) x[node.dof] = value;
+  for (const Node &node : nodes_) x[node.dof] = values[scalar_of(node)];
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode AirwayNodes::sum(Vec local, PetscReal &sum) const
+PetscErrorCode AirwayNodes::fill_global(Vec X, const std::vector<PetscReal> &values) const
 {
   PetscFunctionBeginUser;
-  const ReadArray x(local);
-  sum = 0;
-  for (const Node &node : nodes_) sum += x[node.dof];
-  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &sum, 1, MPIU_REAL, MPI_SUM, comm_));
+  WriteArray x(X);
+  for (const Node &node : nodes_)
+    if (node.row >= 0) x[node.row - first_] = values[scalar_of(node)];
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -411,11 +410,7 @@ PetscErrorCode AirwayNodes::flow_derivatives(Vec y, const std::vector<PetscReal>
   VecHandle product;
 
   PetscFunctionBeginUser;
-  {
-    WriteArray direction(y);
-    for (const Node &node : nodes_)
-      if (node.row >= 0) direction[node.row - first_] = scalars[scalar_of(node)];
-  }
+  PetscCall(fill_global(y, scalars));
   PetscCall(MatCreateVecs(flux_rows_, nullptr, product.out()));
   PetscCall(MatMult(flux_rows_, y, product));
   derivatives.assign(value_.size(), 0);

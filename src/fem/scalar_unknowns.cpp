@@ -19,8 +19,8 @@ constexpr PetscReal residual_share = 0.1;
 /// in them: the quotient is exact.
 constexpr PetscReal difference = 1e-4;
 
-/// Solves the dense system @p a x = @p b (@p a row by row) by elimination with pivots. Where it is singular the result
-/// is not finite, and Newton gives the step up; PETSc's and LAPACK's solvers end the run instead.
+} // namespace
+
 void solve_dense(std::vector<PetscReal> a, std::vector<PetscReal> &b)
 {
   const std::size_t n = b.size();
@@ -43,8 +43,6 @@ void solve_dense(std::vector<PetscReal> a, std::vector<PetscReal> &b)
     b[k] /= a[k * n + k];
   }
 }
-
-} // namespace
 
 std::vector<PetscReal> ScalarUnknowns::storages() const
 {
@@ -80,6 +78,12 @@ void ScalarUnknowns::begin(std::vector<PetscReal> values, bool unknown, PetscRea
   past_.resize(value_.size());
 }
 
+void ScalarUnknowns::recall(PetscReal volume, std::vector<PetscReal> flows)
+{
+  volume_ = volume;
+  flow_ = std::move(flows);
+}
+
 PetscErrorCode ScalarUnknowns::take(Vec X)
 {
   PetscFunctionBeginUser;
@@ -102,7 +106,7 @@ std::vector<ScalarState> ScalarUnknowns::states() const
   return list;
 }
 
-ScalarUnknowns::Rows ScalarUnknowns::evaluate(const OpeningEquation &opening) const
+ScalarUnknowns::Rows ScalarUnknowns::rows(const OpeningEquation &opening) const
 {
   const std::size_t n = size();
   const auto &groups = model_.composition().scalar_groups();
@@ -112,7 +116,9 @@ ScalarUnknowns::Rows ScalarUnknowns::evaluate(const OpeningEquation &opening) co
   rows.by_volume.assign(n, 0);
   rows.by_scalar.assign(n * n, 0);
   rows.by_flow.assign(n * n, 0);
+  rows.by_rate.assign(n * n, 0);
   const Opening first = opening(value_.front(), volume_ + stored(value_));
+  rows.opening = first;
   rows.c[0] = first.c;
   rows.by_volume[0] = first.by_volume;
   for (std::size_t j = 0; j < n; ++j) rows.by_scalar[j] = first.by_volume * storage[j];
@@ -132,6 +138,7 @@ ScalarUnknowns::Rows ScalarUnknowns::evaluate(const OpeningEquation &opening) co
       for (std::size_t j = 0; j < m; ++j) {
         rows.by_scalar[(at + i) * n + at + j] = scale * (own.by_value(i, j) + slope_ * own.by_rate(i, j));
         rows.by_flow[(at + i) * n + at + j] = scale * own.by_flow(i, j);
+        rows.by_rate[(at + i) * n + at + j] = scale * own.by_rate(i, j);
       }
     }
   }
@@ -154,7 +161,7 @@ PetscErrorCode ScalarUnknowns::close(const OpeningEquation &opening, PetscReal v
   volume_ = volume;
   if (!unknown_) PetscFunctionReturn(PETSC_SUCCESS);
   if (of_effects()) PetscCall(model_.airway().flows(local_F, model_.row_scale(pressure), flow_));
-  const Rows rows = evaluate(opening);
+  const Rows rows = this->rows(opening);
   unmet_ = rows.unmet;
   if (!frozen_ && F) PetscCall(model_.airway().set_scalars(F, rows.c));
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -225,7 +232,7 @@ PetscErrorCode ScalarUnknowns::complete(SNES snes, const OpeningEquation &openin
   }
   if (of_effects()) PetscCall(SNESComputeFunction(snes, X, r_)); // the flows are those of X again
   value_ = values;
-  const Rows rows = evaluate(opening);
+  const Rows rows = this->rows(opening);
   PetscCall(SNESGetKSP(snes, &ksp));
   PetscCall(VecNorm(F, NORM_2, &norm));
   PetscCall(along(local, Y, nothing, volume_y, flow_y));

@@ -116,6 +116,20 @@ PetscInt Composition::constant_at(const PetscReal *parameter, const char **owner
   return -1;
 }
 
+bool Composition::read_by_scalars(const PetscReal *setting) const
+{
+  return std::any_of(scalar_groups_.begin(), scalar_groups_.end(), [setting](const ScalarGroup &group) {
+    return std::find(group.parameters.begin(), group.parameters.end(), setting) != group.parameters.end();
+  });
+}
+
+const char *Composition::reader_in_place(const PetscReal *setting) const
+{
+  const auto found =
+      std::find_if(in_place_.begin(), in_place_.end(), [setting](const auto &one) { return one.first == setting; });
+  return found == in_place_.end() ? nullptr : found->second;
+}
+
 std::vector<std::string> Composition::surfaces_that_read(const char *owner) const
 {
   std::vector<std::string> list;

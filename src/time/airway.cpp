@@ -95,6 +95,12 @@ Airway::Condition Airway::condition() const
   c.limited = limited_;
   c.pressure = pressure_;
   c.flow = mode_ == Mode::free ? flow() : 0;
+  if (scalars_.of_effects()) {
+    c.scalars = scalars_.values();
+    c.flows = scalars_.flows();
+    c.scalars.resize(scalars_.size(), 0); // nothing was solved for before the first step
+    c.flows.resize(scalars_.size(), 0);
+  }
   return c;
 }
 
@@ -119,14 +125,20 @@ void Airway::begin(PetscReal t, PetscReal step_end)
 
 ScalarUnknowns::OpeningEquation Airway::equation() const
 {
-  const bool flow = control() == Control::flow;
-  return [this, flow](PetscReal P, PetscReal gas) {
-    const PetscReal h = model_.composition().mesh().length(), modulus = model_.modulus();
-    if (flow) return ScalarUnknowns::Opening{(gas - volume_target_) / (h * h * h), 0, 1 / (h * h * h)};
-    const PetscReal Q = gas_flow(gas), drop = facts_.tube ? facts_.tube->drop(Q) : 0,
-                    slope = facts_.tube ? facts_.tube->slope(Q) : 0;
-    return ScalarUnknowns::Opening{(P + drop - target_) / modulus, 1 / modulus, slope * scheme_.slope() / modulus};
+  return [this, now = control(), target = control() == Control::flow ? volume_target_ : target_](PetscReal P,
+                                                                                                 PetscReal gas) {
+    return equation(model_, facts_.tube, now, target, scheme_.slope(), P, gas, gas_flow(gas));
   };
+}
+
+ScalarUnknowns::Opening Airway::equation(const Model &model, const std::optional<AirwayResistance> &tube,
+                                         Control control, PetscReal target, PetscReal slope, PetscReal P, PetscReal gas,
+                                         PetscReal rate)
+{
+  const PetscReal h = model.composition().mesh().length(), modulus = model.modulus();
+  if (control == Control::flow) return {(gas - target) / (h * h * h), 0, 1 / (h * h * h), 0, -1 / (h * h * h)};
+  const PetscReal drop = tube ? tube->drop(rate) : 0, by_rate = tube ? tube->slope(rate) : 0;
+  return {(P + drop - target) / modulus, 1 / modulus, by_rate * slope / modulus, by_rate / modulus, -1 / modulus};
 }
 
 PetscErrorCode Airway::guess(Vec X) const

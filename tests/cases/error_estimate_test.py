@@ -251,6 +251,35 @@ class SweptErrors(unittest.TestCase):
             self.assertGreater(abs(error), 1e-7 * tight[key], "the run is loose")
             self.assertAlmostEqual(bar["lacks"]["solver"], error, delta=0.1 * abs(error))
 
+    def test_airway_tree(self):
+        """A trunk whose wall stores gas, a branch, a tube: each part against a finer run, on 2 ranks as on one."""
+        tree = pc.scratch("tree.csv")
+        with open(tree, "w", encoding="utf-8") as f:
+            f.write("name,parent,resistance_cmH2O_s_per_l,compliance_ml_per_cmH2O,surface\ntrunk,,20,5,\nbranch,trunk,10,,x1\n")
+        scene = SCENE[:len(pc.BLOCK + pc.DIRECT + pc.QUIET)] + SCENE[len(pc.BLOCK + pc.DIRECT + pc.QUIET + pc.PAPER):] + ["-airway_tree", tree, "-tube", "-tube_k1", "5", "-tube_k2", "4", "-airflow_permeability", "3000"]
+        keys = {"V_T": "tidal_volume_ml", "Q_peak": "peak_flow_ml_per_s"}
+        asked = SWEEP + ["-error_estimate_numbers", ",".join(keys)]
+        steps = ["-ts_dt", "0.025"]
+        run = pc.finished(scene + steps + asked)
+        finer = {"time": pc.finished(scene + ["-ts_dt", "0.003125"]).json(), "space": pc.finished(scene + steps + ["-dm_refine", "1"]).json()}
+        loose = pc.finished(scene + steps + asked + ["-snes_rtol", "1e-3", "-snes_atol", "1e-4", "-snes_stol", "0"])
+        tight = pc.finished(scene + steps + ["-snes_rtol", "1e-12", "-snes_atol", "1e-12"]).json()
+        more = pc.finished(scene + steps + asked, ranks=2)
+        for key in keys.values():
+            value, lacks = bars(run)[key]["value"], bars(run)[key]["lacks"]
+            found = {"time": lacks["steps"] + lacks["rows"], "space": lacks["flow_in_space"] + lacks["tissue_in_space"]}
+            for part, truth in finer.items():
+                error = truth[key] - value
+                print(f"{key} {value:.6g}, {part}: error {error:.4g}, found {found[part]:.4g}")
+                if abs(error) > 1e-4 * value:
+                    self.assertGreater(found[part] / error, 0.5)
+                    self.assertLess(found[part] / error, 2)
+            error = tight[key] - bars(loose)[key]["value"]
+            self.assertGreater(abs(error), 1e-8 * value, "the run is loose")
+            self.assertAlmostEqual(bars(loose)[key]["lacks"]["solver"], error, delta=0.1 * abs(error))
+            for name, lack in lacks.items():
+                self.assertAlmostEqual(lack, bars(more)[key]["lacks"][name], delta=1e-6 * abs(value), msg=key + name)
+
     def test_ranks_and_cells(self):
         """The same on any number of ranks; the cells of errors.xdmf add up to the part in space."""
         import h5py

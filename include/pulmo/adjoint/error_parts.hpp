@@ -11,7 +11,7 @@ namespace pulmo {
 /// its multipliers a better run has the number G + sum of z . R_better(x) to first order (Giles & Suli, Acta Numerica
 /// 11, 2002, 145-236):
 ///
-/// solver  R as it is, and the equation of the opening: what Newton left;
+/// solver  R as it is, and the equations of scalars: what Newton left;
 /// time    rates of one order more: the polynomial through states of the phase before and after the stage. Beside
 ///         that the number itself is a sum over the rows, and its largest values lie between them
 ///         (Functional::better_value);

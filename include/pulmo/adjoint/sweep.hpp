@@ -7,6 +7,7 @@
 #include "pulmo/adjoint/memory_sweep.hpp"
 #include "pulmo/time/simulation.hpp"
 
+#include <algorithm>
 #include <functional>
 #include <map>
 
@@ -18,14 +19,19 @@ namespace pulmo {
 ///   (dR_n/dx_n)^T z_n = - dG/dx_n - sum over later stages m of (dR_m/dx_n)^T z_m,
 ///   dG/dp = sum over all n of z_n . dR_n/dp.
 ///
-/// The matrix is the transposed Jacobian of the stage, in the run's own matrix and by its own solver. Where the
-/// pressure at the opening is an unknown its equation c(P, V) = 0 has a multiplier of its own, eliminated as in
-/// ScalarUnknowns. The consistent flux into a held airway is a sum of rows of R_n: its derivative stands in z_n at
-/// these nodes. What effects remember has multipliers of its own (MemorySweep).
+/// The matrix is the transposed Jacobian of the stage, in the run's own matrix and by its own solver. Where scalars s
+/// are unknown (ScalarUnknowns) each of their equations c(s, ds/dt, V, Q) = 0 has a multiplier m of its own. The
+/// consistent fluxes Q into a held airway are sums of rows of R_n: their derivatives stand in z_n at these nodes. With
+/// y_V and y_j, the z_n of a unit of the lung's volume and of the flux by scalar j,
+///
+///   z_n = y_0 + y_V sum_i m_i dc_i/dV + sum_j y_j sum_i m_i dc_i/dQ_j,
+///
+/// and a dense system makes z_n . dR_n/ds + m . dc/ds what is wanted of the scalars. What effects remember has
+/// multipliers of its own (MemorySweep).
 class Sweep {
 public:
   Sweep(const Scene &scene, Model &model, Simulation &simulation, const Trajectory &trajectory)
-      : scene_(scene), model_(model), simulation_(simulation), trajectory_(trajectory)
+      : scene_(scene), model_(model), simulation_(simulation), trajectory_(trajectory), scalars_(model)
   {}
 
   /// What keeps the sweep from this scene, as the end of a sentence; empty: nothing does.
@@ -39,9 +45,13 @@ public:
     std::vector<Vec> adjoint;         ///< [functional]: z, local, with the rows of a held airway
     std::vector<PetscReal> by_target; ///< [functional]: its derivative by StageRecord::airway.target (ask_targets())
     /// [functional]: what it wants of the volume, 1/mm^3, and of the mean pressure of a free airway, 1/kPa, with the
-    /// multiplier of the opening's equation in place, which stands in @p opening.
-    std::vector<PetscReal> by_volume, by_mean_pressure, opening;
-    std::vector<PetscReal> by_flow; ///< [functional]: of the gas of this stage through the opening, s/mm^3
+    /// multipliers of the scalars' equations in place.
+    std::vector<PetscReal> by_volume, by_mean_pressure;
+    std::vector<PetscReal> by_flow; ///< [functional]: by the rate of the lung's volume in the opening's flow, s/mm^3
+    std::vector<PetscReal> by_drop; ///< [functional]: by what the pressure falls along the tube, 1/kPa
+    /// [functional][scalar]: by the rates of scalars, s/kPa; and the multipliers of their equations
+    /// (weighted_scalars())
+    std::vector<std::vector<PetscReal>> by_rate, multipliers;
     /// What the number itself wants of the volume of a part of the lung.
     struct OfPart {
       const std::vector<PetscInt> *cells = nullptr; ///< of this rank; null: it is of the whole lung
@@ -82,28 +92,44 @@ public:
   void heed(StopRequest &request) { stop_request_ = &request; }
   bool stopped() const { return stopped_; }
 
-  /// What the solver left of the equation c(P, V) = 0 of the pressure at the opening, where that is an unknown.
-  PetscReal left_at_opening(const Solved &stage) const;
-  /// Of a stage, mm^3 above rest; once the sweep has begun.
+  /// The equations of the scalars of @p stage, the one solved last, times their multipliers: [functional], with the
+  /// settings as they are now.
+  std::vector<PetscReal> weighted_scalars(const Solved &stage) const;
+  /// Of a stage, once the sweep has begun: the lung's volume, mm^3 above rest; the flow through the opening, mm^3/s;
+  /// the scalars of effects and the opening's pressure, kPa (empty without the former).
   PetscReal volume(PetscInt stage) const { return volumes_[static_cast<std::size_t>(stage)]; }
+  PetscReal flow(PetscInt stage) const { return flows_[static_cast<std::size_t>(stage)]; }
+  const std::vector<PetscReal> &scalars(PetscInt stage) const
+  {
+    return trajectory_.stages()[static_cast<std::size_t>(stage)].airway.scalars;
+  }
   PetscInt solves() const { return solves_; }
   PetscInt krylov() const { return krylov_; }
 
 private:
   /// What later stages and the number itself want of a stage.
   struct Wanted {
-    VecHandle state;                              ///< local, to be summed over the ranks; null: nothing
-    PetscReal volume = 0, pressure = 0, flow = 0; ///< per mm^3, kPa (at the opening), mm^3/s
-    PetscReal part = 0;                           ///< per mm^3 of the part that the number is of
-    MemorySweep::Values memory;                   ///< by what is remembered; empty: nothing
-    bool nothing() const { return !state && volume == 0 && pressure == 0 && flow == 0 && part == 0 && memory.empty(); }
+    VecHandle state;                ///< local, to be summed over the ranks; null: nothing
+    PetscReal volume = 0, flow = 0; ///< of the lung, per mm^3; into the lung, per mm^3/s
+    PetscReal stored = 0, drop = 0; ///< flow into what is stored beside it, per mm^3/s; along the tube, per kPa
+    std::vector<PetscReal> scalars; ///< per kPa; the opening's pressure first (of a free airway its mean)
+    PetscReal part = 0;             ///< per mm^3 of the part that the number is of
+    MemorySweep::Values memory;     ///< by what is remembered; empty: nothing
+    bool nothing() const
+    {
+      return !state && volume == 0 && flow == 0 && stored == 0 && part == 0 && memory.empty() &&
+             std::all_of(scalars.begin(), scalars.end(), [](PetscReal by) { return by == 0; });
+    }
     const MemorySweep::Values *weights() const { return memory.empty() ? nullptr : &memory; }
   };
   using Pending = std::map<PetscInt, std::vector<Wanted>>;
 
-  /// Derivatives of the equation of the pressure at the opening.
-  struct Opening {
-    PetscReal by_pressure = 0, by_volume = 0, by_flow = 0, by_target = 0; ///< by_flow: of the gas, through pasts, too
+  /// What the scalars' equations see of the fields adds to z, for a unit of it.
+  struct Border {
+    bool seen = false;
+    VecHandle right;                  ///< global
+    VecHandle z;                      ///< local
+    std::vector<PetscReal> by_scalar; ///< z . dR/ds
   };
 
   PetscErrorCode setup(const std::vector<Functional> &functionals);
@@ -114,25 +140,41 @@ private:
   void want_row(const std::vector<Functional> &functionals, PetscInt stage, Pending &pending) const;
   /// Adds a derivative by the pressure at the ventilator at the end of a stage, 1/kPa.
   void want_ventilator_pressure(PetscInt stage, PetscReal derivative, Wanted &wanted) const;
-  /// Adds a derivative by the flow of gas of a stage, s/mm^3, to the volumes that it looks back at.
+  /// Adds a derivative by the volume of the gas beyond the opening, 1/mm^3.
+  void want_gas(PetscReal derivative, Wanted &wanted) const;
+  /// Adds a derivative by the rate of the volume of a stage, s/mm^3, to the volumes that it looks back at.
   void want_past_volumes(const StageRecord &record, PetscReal by_flow, std::size_t k, Pending &pending) const;
   /// Makes the model that of a stage; fills x_ and rate_.
   PetscErrorCode recall(const StageRecord &record, PetscInt number);
-  /// Derivative of the local residual by the pressure at the opening, 1/kPa, or by the flow prescribed on a free
+  std::vector<PetscReal> values_of(const StageRecord &record) const;
+  /// Derivatives of the local residual by the scalars that act on it, 1/kPa, or by the flow prescribed on a free
   /// airway, s/mm^3.
-  PetscErrorCode make_column(const StageRecord &record);
+  PetscErrorCode make_columns(const StageRecord &record);
+  PetscErrorCode make_column(const StageRecord &record, std::size_t scalar, Vec column);
   PetscErrorCode assemble(const StageRecord &record, PetscInt number);
   PetscErrorCode right_side(const StageRecord &record, std::size_t k, Wanted &w, Pending &pending, Vec right);
-  Opening opening(const StageRecord &record, PetscInt number) const;
-  /// Rate of the volume by the time scheme, mm^3/s.
-  PetscReal volume_rate(const StageRecord &record, PetscInt number) const;
-  PetscErrorCode solve_border(const Opening &c, std::string &failure);
-  PetscErrorCode solve_stage(const StageRecord &record, const Opening &c, std::size_t k, const Wanted &w, Vec right,
-                             Pending &pending, Solved &result, std::string &failure);
+  /// Rate of the gas beyond the opening by the time scheme, mm^3/s.
+  PetscReal gas_rate(const StageRecord &record, PetscInt number) const;
+  /// The scalars' equations, whose derivatives rows_ has, at a stage that was recalled.
+  ScalarUnknowns::OpeningEquation equation(const StageRecord &record, PetscInt number) const;
+  PetscErrorCode recall_scalars(const StageRecord &record, PetscInt number);
+  /// Right-hand sides of the borders, before the airway's rows are closed; then their solutions.
+  PetscErrorCode begin_borders();
+  PetscErrorCode solve_borders(std::string &failure);
+  /// The multipliers of the scalars' equations, where @p wanted is what is wanted of the scalars beside them.
+  std::vector<PetscReal> solve_scalars(const std::vector<PetscReal> &wanted) const;
+  PetscErrorCode add_scalars(const StageRecord &record, std::size_t k, const std::vector<PetscReal> &wanted,
+                             Solved &result, std::string &failure);
+  PetscErrorCode solve_stage(const StageRecord &record, std::size_t k, const Wanted &w, Vec right, Pending &pending,
+                             Solved &result, std::string &failure);
+  /// Adds what @p result, solved, wants of earlier stages through the opening and the scalars.
+  void look_back_at_scalars(const StageRecord &record, std::size_t k, const Solved &result, Pending &pending);
   PetscErrorCode solve(Vec right, Vec solution, std::string &failure);
   PetscErrorCode to_global(Vec local, Vec global) const;
   PetscErrorCode to_local(Vec global, Vec local) const;
   PetscErrorCode dot(Vec a, Vec b, PetscReal &sum) const;
+  /// z . dR/ds of the scalars that act.
+  PetscErrorCode along_columns(Vec z, std::vector<PetscReal> &by_scalar) const;
   /// Adds (dR/dx_i)^T z for the stages that @p record looks back at.
   PetscErrorCode look_back(const StageRecord &record, Vec z, std::size_t functional, Pending &pending);
   /// Adds what is remembered of a stage to what is wanted of its state and of those that it looks back at.
@@ -159,11 +201,18 @@ private:
     PetscInt age = 0;
     PetscReal slope = 0;
     Airway::Mode mode = Airway::Mode::held;
-  } kept_;                                                     ///< the stage whose preconditioner is in use, stages ago
-  std::vector<PetscReal> volumes_, flows_;                     ///< [stage]: mm^3; through the opening, mm^3/s
-  VecHandle x_, rate_, past_, column_, border_, work_, other_; ///< local
-  VecHandle right_, held_, product_, residual_;                ///< global
-  PetscReal border_column_ = 0, tolerance_ = 0;
+  } kept_;                                      ///< the stage whose preconditioner is in use, stages ago
+  std::vector<PetscReal> volumes_, flows_;      ///< [stage]: mm^3; through the opening, mm^3/s
+  VecHandle x_, rate_, past_, work_, other_;    ///< local
+  VecHandle right_, held_, product_, residual_; ///< global
+  ScalarUnknowns scalars_;                      ///< as they were in the stage at hand, where they are unknown
+  ScalarUnknowns::Rows rows_;
+  std::vector<PetscReal> storages_; ///< [scalar]: mm^3/kPa
+  std::vector<std::size_t> acting_; ///< scalars that the fields see
+  std::vector<VecHandle> columns_;  ///< [of these]
+  Border volume_;                   ///< of the opening's equation
+  std::vector<Border> fluxes_;      ///< [of acting_]
+  PetscReal tolerance_ = 0;
   StopRequest *stop_request_ = nullptr;
   bool stopped_ = false;
   PetscInt solves_ = 0, krylov_ = 0;

@@ -70,10 +70,16 @@ public:
   PetscErrorCode mean_pressure(Vec local, PetscReal &mean) const;
   /// Adds @p factor times the derivative of that mean to a local vector.
   PetscErrorCode add_mean_gradient(PetscReal factor, Vec local) const;
-  /// Writes @p value at all nodes of a local vector.
-  PetscErrorCode fill(Vec local, PetscReal value) const;
-  /// Sum of a local vector over the nodes. Collective.
-  PetscErrorCode sum(Vec local, PetscReal &sum) const;
+  /// Writes @p values, by scalar, at the nodes whose pressure they are, of a local vector, and of a global one.
+  PetscErrorCode fill(Vec local, const std::vector<PetscReal> &values) const;
+  PetscErrorCode fill_global(Vec X, const std::vector<PetscReal> &values) const;
+  /// One value for all nodes.
+  PetscErrorCode fill(Vec local, PetscReal value) const
+  {
+    return fill(local, std::vector<PetscReal>(value_.size(), value));
+  }
+  /// Sums of a local vector over the nodes of each scalar. Collective.
+  PetscErrorCode sum(Vec local, std::vector<PetscReal> &sums) const { return flows(local, 1, sums); }
   /// Flow into the lung by the pressure of each scalar, mm^3/s: the consistent flux, from a local residual whose mass
   /// rows were scaled by @p scale. Where p is held the mass residual is - int Q.N q; summed over the nodes where the
   /// lung is open it is exactly the rate of int (J - 1). Collective.

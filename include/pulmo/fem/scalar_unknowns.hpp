@@ -21,11 +21,20 @@ namespace pulmo {
 class ScalarUnknowns {
 public:
   /// The equation of the pressure P at the opening, c(P, V) = 0, dimensionless; V: of the gas beyond it, mm^3
-  /// above rest.
+  /// above rest. @p by_volume: with the rate of V; @p by_flow: of that alone; @p by_target: of what is prescribed.
   struct Opening {
-    PetscReal c = 0, by_pressure = 0, by_volume = 0;
+    PetscReal c = 0, by_pressure = 0, by_volume = 0, by_flow = 0, by_target = 0;
   };
   using OpeningEquation = std::function<Opening(PetscReal pressure, PetscReal volume)>;
+  /// The equations and their derivatives by scalars, lung volume and flows.
+  struct Rows {
+    std::vector<PetscReal> c, by_volume; ///< [equation]
+    std::vector<PetscReal> by_scalar;    ///< [equation][scalar], fields fixed, its rate not
+    std::vector<PetscReal> by_rate;      ///< [equation][scalar], of effects' equations: by its rate alone
+    std::vector<PetscReal> by_flow;      ///< [equation][scalar whose surfaces it enters by]
+    PetscReal unmet = 0;                 ///< of the effects', the worst, kPa
+    Opening opening;
+  };
 
   explicit ScalarUnknowns(Model &model) : model_(model) {}
 
@@ -43,10 +52,16 @@ public:
   std::vector<ScalarState> states() const;
   /// Gas stored beside the lung at scalars @p values, mm^3; of their rates (kPa/s): what flows there, mm^3/s.
   PetscReal stored(const std::vector<PetscReal> &values) const;
+  /// The same of each scalar, mm^3/kPa.
+  std::vector<PetscReal> storages() const;
 
   /// Begins an attempt at a stage: scalars start at @p values; d(value)/dt = @p slope (1/s) value + @p past (kPa/s).
   /// @p unknown: Newton solves for them; else the opening's is given and effects have none.
   void begin(std::vector<PetscReal> values, bool unknown, PetscReal slope, std::vector<PetscReal> past);
+  /// Takes what an accepted stage had, after begin(): the lung's @p volume and the @p flows; then rows() are its own.
+  void recall(PetscReal volume, std::vector<PetscReal> flows);
+  /// The equations as they are at the values at hand.
+  Rows rows(const OpeningEquation &opening) const;
   /// Holds them at their last values for as long as @p frozen: the assembled Jacobian is that of the residual without
   /// them and their equations.
   void freeze(bool frozen) { frozen_ = frozen && unknown_; }
@@ -61,19 +76,10 @@ public:
   PetscErrorCode complete(SNES snes, const OpeningEquation &opening, Mat A, Vec X, Vec Y, Vec local, PetscInt &krylov);
 
 private:
-  /// The equations and their derivatives by scalars, lung volume and flows, all as they are at values_.
-  struct Rows {
-    std::vector<PetscReal> c, by_volume; ///< [equation]
-    std::vector<PetscReal> by_scalar;    ///< [equation][scalar], fields fixed
-    std::vector<PetscReal> by_flow;      ///< [equation][scalar whose surfaces it enters by]
-    PetscReal unmet = 0;                 ///< of the effects', the worst, kPa
-  };
-  Rows evaluate(const OpeningEquation &opening) const;
   /// d(volume, flows) along a change @p y of the fields and @p scalars of the scalars.
   PetscErrorCode along(Vec local, Vec y, const std::vector<PetscReal> &scalars, PetscReal &volume,
                        std::vector<PetscReal> &flow);
   PetscErrorCode create_vectors(Vec like, Vec like_local);
-  std::vector<PetscReal> storages() const;
   /// What makes an effect's equation dimensionless, as the mass rows are in proportion to a flow: the same for a whole
   /// attempt. A pressure behind a large resistance would else drown all other rows.
   PetscReal scale_of(std::size_t equation, ScalarRows &own, std::size_t row) const;
@@ -87,5 +93,9 @@ private:
   std::vector<VecHandle> column_, solution_;
   VecHandle x_, r_, local_y_;
 };
+
+/// Solves the dense system @p a x = @p b (@p a row by row) by elimination with pivots. Where it is singular the result
+/// is not finite, for the caller to see; PETSc's and LAPACK's solvers end the run instead.
+void solve_dense(std::vector<PetscReal> a, std::vector<PetscReal> &b);
 
 } // namespace pulmo

@@ -131,7 +131,8 @@ struct ScalarGroup {
   std::string effect;
   std::vector<ScalarSpec> scalars;
   ScalarEquations equations;
-  std::size_t offset = 0; ///< number of the first one among those of all effects
+  std::vector<const PetscReal *> parameters; ///< settings that the equations read anew at each call
+  std::size_t offset = 0;                    ///< number of the first one among those of all effects
 };
 
 /// A share of the energy balance that scalars have.
@@ -332,13 +333,23 @@ public:
   const std::vector<RememberedIntegral> &integrals() const { return integrals_; }
   /// Scalars that are remembered at a point of a cell, or of a facet of @p surface.
   PetscInt memory_width(const std::string &surface = "") const;
-  /// Adds scalar unknowns and as many equations.
-  void scalars(std::vector<ScalarSpec> list, ScalarEquations equations)
+  /// Adds scalar unknowns and as many equations. @p parameters: settings that these read anew at each call, so that a
+  /// backward sweep may move them.
+  void scalars(std::vector<ScalarSpec> list, ScalarEquations equations, std::vector<const PetscReal *> parameters = {})
   {
-    scalar_groups_.push_back({effect_, std::move(list), std::move(equations), n_scalars_});
+    scalar_groups_.push_back({effect_, std::move(list), std::move(equations), std::move(parameters), n_scalars_});
     n_scalars_ += scalar_groups_.back().scalars.size();
   }
+  /// Whether a scalar's equation reads @p setting so.
+  bool read_by_scalars(const PetscReal *setting) const;
   const std::vector<ScalarGroup> &scalar_groups() const { return scalar_groups_; }
+  /// Names settings that the kernels of @p owner read where they are, by a pointer among their parameters.
+  void read_in_place(const char *owner, const std::vector<const PetscReal *> &settings)
+  {
+    for (const PetscReal *setting : settings) in_place_.emplace_back(setting, owner);
+  }
+  /// Whose kernels read @p setting so; null: none.
+  const char *reader_in_place(const PetscReal *setting) const;
   /// Scalar unknowns of all effects; the pressure at the airway opening is not among them.
   std::size_t n_scalars() const { return n_scalars_; }
   /// A term of the energy balance for what the scalars of the effect that speaks do.
@@ -517,6 +528,7 @@ private:
   std::vector<MemorySpec> memories_;
   std::vector<RememberedIntegral> integrals_;
   std::vector<ScalarGroup> scalar_groups_;
+  std::vector<std::pair<const PetscReal *, const char *>> in_place_; ///< settings, and whose kernels read them
   std::vector<ScalarEnergyTerm> scalar_energies_;
   std::vector<SignalSpec> signals_;
   std::vector<SignalLimit> limits_;
@@ -624,9 +636,10 @@ struct SceneFacts {
   std::vector<LoadTime> load_times; ///< of loads other than the ventilator's
   Settling settling;
   FlowSplit flow_split = FlowSplit::automatic;
-  std::optional<AirwayResistance> tube; ///< between ventilator and airway
-  std::string surface_pressures_by;     ///< the effect that solves for the pressures of the open surfaces; or nothing
-  bool pressure_damping = false;        ///< oscillations of the pressure are damped
+  std::optional<AirwayResistance> tube;         ///< between ventilator and airway
+  std::function<AirwayResistance()> tube_again; ///< that of its settings as they are now
+  std::string surface_pressures_by; ///< the effect that solves for the pressures of the open surfaces; or nothing
+  bool pressure_damping = false;    ///< oscillations of the pressure are damped
 
   /// Whether some phase leaves the airway's pressure field free, with its flux prescribed.
   bool free_airway() const

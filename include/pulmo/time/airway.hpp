@@ -31,7 +31,11 @@ public:
 
   const char *name() const override { return "airway"; }
   /// The run begins at rest.
-  void start() { before_.assign(scalars_.size(), 0); }
+  void start()
+  {
+    before_.assign(scalars_.size(), 0);
+    scalars_.begin(before_, false, 1, {}); // the first step of BDF2 looks back at all of them
+  }
   /// Begins a phase at lung volume @p volume (mm^3 above rest) whose first step is to take @p first_step s. A ramp of
   /// pressure without a start value starts from what the ventilator has then.
   void begin_phase(const Phase &phase, PetscReal volume, PetscReal first_step);
@@ -65,6 +69,11 @@ public:
   }
   /// The equation of the opening in the step at hand.
   ScalarUnknowns::OpeningEquation equation() const;
+  /// The same of any stage, at pressure @p P and @p gas beyond the opening that changes at @p rate. @p target: as in
+  /// Condition; @p slope: of the rate by the gas, 1/s.
+  static ScalarUnknowns::Opening equation(const Model &model, const std::optional<AirwayResistance> &tube,
+                                          Control control, PetscReal target, PetscReal slope, PetscReal P,
+                                          PetscReal gas, PetscReal rate);
   ScalarUnknowns &scalars() { return scalars_; }
   const ScalarUnknowns &scalars() const { return scalars_; }
 
@@ -99,6 +108,8 @@ public:
     bool limited = false;   ///< the target is the limit of the phase
     PetscReal pressure = 0; ///< at the opening, kPa
     PetscReal flow = 0;     ///< prescribed on a free airway, mm^3/s
+    /// Where effects have scalars: all of them, the opening's first, kPa; what flows into the lung by each, mm^3/s.
+    std::vector<PetscReal> scalars = {}, flows = {};
   };
   Condition condition() const;
   /// What of volume and pressure the step at hand leaves free.

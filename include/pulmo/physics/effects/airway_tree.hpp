@@ -31,6 +31,7 @@ struct AirwayBranch {
   PetscReal entrance = 0;                 ///< the factor is max(1, entrance sqrt |q|), sqrt(s/mm^3)
   PetscReal compliance = 0;               ///< of the wall, mm^3/kPa
   std::vector<SurfacePart> surfaces = {}; ///< that it ends at
+  PetscReal length = 0, diameter = 0;     ///< 0: its resistance is given
   PetscReal factor(PetscReal q) const { return std::max<PetscReal>(1, entrance * std::sqrt(std::abs(q))); }
   /// Fall of the pressure along it at flow @p q, mm^3/s, and the derivative of that.
   PetscReal drop(PetscReal q) const { return resistance * factor(q) * q; }
@@ -42,6 +43,7 @@ class AirwayNetwork {
 public:
   explicit AirwayNetwork(std::vector<AirwayBranch> branches) : branches_(std::move(branches)) {}
   const std::vector<AirwayBranch> &branches() const { return branches_; }
+  std::vector<AirwayBranch> &branches() { return branches_; }
 
   /// Flow that enters each branch, mm^3/s.
   std::vector<PetscReal> flows(const ScalarState &s) const
@@ -176,7 +178,7 @@ public:
                    "-ventilator_flow_split uniform shares the flow by area, -airway_tree by resistance; leave one out");
     if (file_ == "star")
       for (const std::string &surface : facts.airway_surfaces)
-        branches.push_back({surface, -1, resistance_ * units::kPa_per_cmH2O / mm3_per_l, 0, 0, {{surface, ""}}});
+        branches.push_back({surface, -1, 0, 0, 0, {{surface, ""}}});
     else
       PetscCall(read_branches(comm, branches));
     PetscCall(mesh.regions(regions));
@@ -196,6 +198,7 @@ public:
                        "-airway_tree: branch '%s' ends in '%s', and the mesh has no volume of that name; it has: %s",
                        branch.name.c_str(), part.region.c_str(), names.c_str());
       }
+    for (AirwayBranch &branch : branches) set_resistance(branch);
     network_ = std::make_shared<AirwayNetwork>(std::move(branches));
     PetscFunctionReturn(PETSC_SUCCESS);
   }
@@ -205,7 +208,14 @@ public:
     std::vector<ScalarSpec> list;
     for (const AirwayBranch &branch : network_->branches())
       list.push_back({branch.name, branch.surfaces, branch.compliance});
-    c.scalars(list, [n = network_](const ScalarState &s, ScalarRows &rows) { n->equations(s, rows); });
+    const auto equations = [this](const ScalarState &s, ScalarRows &rows) {
+      for (AirwayBranch &branch : network_->branches()) set_resistance(branch);
+      network_->equations(s, rows);
+    };
+    if (file_ == "star")
+      c.scalars(list, equations, {&resistance_});
+    else
+      c.scalars(list, equations, {&viscosity_, &density_});
     c.scalar_energy(
         Energy::dissipated, "resistive_airways",
         [n = network_](const ScalarState &now, const ScalarState &, PetscReal dt) { return n->resistive(now, dt); });
@@ -230,10 +240,13 @@ private:
     });
   }
 
-  /// Resistance of a branch from its size.
-  void set_size(PetscReal length, PetscReal diameter, AirwayBranch &branch) const
+  /// Resistance of a branch by the settings as they are now, where the table does not give it.
+  void set_resistance(AirwayBranch &branch) const
   {
     constexpr PetscReal kPa_per_Pa = 1e-3, mm_per_m = 1e3;
+    const PetscReal length = branch.length, diameter = branch.diameter;
+    if (file_ == "star") branch.resistance = resistance_ * units::kPa_per_cmH2O / mm3_per_l;
+    if (length == 0) return;
     const PetscReal mu = viscosity_ * kPa_per_Pa,                 // kPa s
         rho = density_ * kPa_per_Pa / (mm_per_m * mm_per_m),      // kPa s^2/mm^2
         reynolds_per_flow = 4 * rho / (PETSC_PI * mu * diameter); // s/mm^3
@@ -300,8 +313,9 @@ private:
     if (resistance)
       branch.resistance = *resistance * units::kPa_per_cmH2O / mm3_per_l;
     else
-      set_size(*length, *diameter, branch);
+      branch.length = *length, branch.diameter = *diameter;
     branch.compliance = compliance.value_or(0) * units::mm3_per_ml / units::kPa_per_cmH2O;
+    set_resistance(branch);
     PulmoUserCheck(std::isfinite(branch.resistance + branch.entrance + branch.compliance), comm,
                    "%s: branch '%s' has a resistance or compliance that is no finite number; check its sizes and their "
                    "units",
@@ -314,7 +328,7 @@ private:
   std::string file_;
   Csv table_;
   PetscReal resistance_ = 0, viscosity_ = 1.8e-5, density_ = 1.2;
-  std::shared_ptr<const AirwayNetwork> network_;
+  std::shared_ptr<AirwayNetwork> network_;
 };
 
 } // namespace pulmo

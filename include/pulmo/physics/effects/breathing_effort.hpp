@@ -207,6 +207,8 @@ public:
     course_.facts = &facts;
     parameters_.course = constants::to_scalar(static_cast<const EffortCourse *>(&course_));
     c.parameters(parameters_);
+    c.read_in_place(P::owner,
+                    {&course_.delay, &course_.amplitude, &course_.rise, &course_.hold, &course_.fall, &course_.period});
     for (const std::string &surface : surfaces_) {
       c.surface_residual("-p_s cof F N . eta", surface, displacement, f0(surface_residual<P, K::pull>));
       c.surface_jacobian("suction", surface, displacement, displacement,

@@ -32,9 +32,8 @@ public:
 
   PetscErrorCode announce(SceneFacts &facts) override
   {
-    constexpr PetscReal mm3_per_l = 1000 * units::mm3_per_ml;
-    facts.tube =
-        AirwayResistance{k1_ * units::kPa_per_cmH2O / mm3_per_l, k2_ * units::kPa_per_cmH2O / (mm3_per_l * mm3_per_l)};
+    facts.tube = resistance();
+    facts.tube_again = [this] { return resistance(); };
     return PETSC_SUCCESS;
   }
 
@@ -48,6 +47,12 @@ public:
   }
 
 private:
+  AirwayResistance resistance() const
+  {
+    constexpr PetscReal mm3_per_l = 1000 * units::mm3_per_ml;
+    return {k1_ * units::kPa_per_cmH2O / mm3_per_l, k2_ * units::kPa_per_cmH2O / (mm3_per_l * mm3_per_l)};
+  }
+
   bool on_ = false;
   PetscReal k1_ = 0, k2_ = 0;
 };
