@@ -28,7 +28,7 @@ MOST_RUNS = 12
 # corrected value over its parts, the largest share that is resolved
 SWEPT = {**SHORT, "plateau_pressure_cmH2O": "P_plat", "peak_expiratory_flow_ml_per_s": "Q_exp", "work_j": "work"}
 SEEN, FACTOR, LARGEST = 0.75, 0.5, 0.1
-EARLY = "by a trigger or by cycling"  # in what a sweep says of phases whose ends jump by whole steps
+EARLY, FEW = "phase_ended_early", "few_steps_in_a_phase"  # of "not_resolved_because" (pulmo/observers/error_bars.hpp)
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,7 @@ class Goal:
         if math.isinf(geometry) and finer > TELLING:
             return math.inf
         geometry = 0 if math.isinf(geometry) else geometry * finer ** 2
-        if part["not_resolved"] and "for its phases" in part["not_resolved"] and shorter > 0.5:
+        if FEW in part["not_resolved_because"] and shorter > 0.5:
             return math.inf
         if max(time, space) > LARGEST * abs(value):
             return math.inf
@@ -248,7 +248,7 @@ class Goal:
         else:
             choice = Choice(max(o.lung or [FIRST_SIZE]), dt)
         while self.attempt(choice):
-            if any(EARLY in (self.last.parts[key]["not_resolved"] or "") for key in self.asked):
+            if any(EARLY in self.last.parts[key]["not_resolved_because"] for key in self.asked):
                 self.refused = "-error_estimate_method sweep has no error in time where a phase ends early; ladders may take over (--method ladder)"
                 return False
             if self.met() or len(self.outcomes) >= MOST_RUNS:
