@@ -279,7 +279,7 @@ class SweptErrors(unittest.TestCase):
         bar = bars(pc.finished(scene + STEPS + SWEEP))["peak_expiratory_flow_ml_per_s"]
         self.assertIsNone(bar["time"])
         self.assertIn("steps too long", bar["not_resolved"])
-        self.assertEqual(bar["not_resolved_because"], ["few_steps_in_a_phase"])
+        self.assertIn("few_steps_in_a_phase", bar["not_resolved_because"])
 
     def test_a_sweep_that_fails(self):
         """Linear systems that are not solved: the reason, and no bars of the steps that were."""

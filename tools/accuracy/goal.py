@@ -33,7 +33,8 @@ EARLY, FEW = "phase_ended_early", "few_steps_in_a_phase"  # of "not_resolved_bec
 
 @dataclass(frozen=True)
 class Choice:
-    """A setting. size: of the cells, mm, or over that of a mesh from a file. field: errors.xdmf that they follow; mesh, refined: a file that is there."""
+    """A setting. size: of the cells, mm, or over that of a mesh from a file. field: errors.xdmf that they follow; mesh: a file that is there, or was
+    the first; refined: as a whole."""
     size: float
     dt: float
     scheme: str = "beuler"
@@ -43,8 +44,12 @@ class Choice:
 
     @property
     def name(self):
-        what = f"{Path(self.mesh).stem}{f' refined {self.refined} x' if self.refined else ''}" if self.mesh else (
-            f"size {self.size:.3g} mm" + (", by the errors of the run before" if self.field else ""))
+        if self.mesh:
+            what = Path(self.mesh).stem + (f" refined {self.refined} x" if self.refined else "") + (
+                f", cells cut to {self.size ** -3:.2g} times as many" if self.field else "")
+        else:
+            what = f"size {self.size:.3g} mm"
+        what += ", by the errors of the run before" if self.field else ""
         return f"{what} | {settings.Steps(self.scheme, self.dt).name}"
 
 
@@ -66,12 +71,25 @@ class Outcome:
         return part["value"] + lacks["steps"] + lacks["rows"] + lacks["solver"] + (lacks["flow_in_space"] + lacks["tissue_in_space"]) / SEEN
 
 
+def can_be_cut(path):
+    """Whether tools/lung_mesh --refine keeps all of a mesh; if not, says why."""
+    from meshing.mesh import MeshError  # gmsh takes its time
+    from meshing.refine import named_mesh
+    try:
+        named_mesh(path)
+    except MeshError as error:
+        print(f"finer meshes are {path} refined as a whole: {error}", flush=True)
+        return False
+    return True
+
+
 class Goal:
     """The search for a run whose corrected values have bars within what is asked: number -> share."""
 
     def __init__(self, asked, scene, options):
         self.asked, self.scene, self.options = asked, scene, options
         self.spent, self.outcomes, self.refused = 0.0, [], ""
+        self.made, self.adapt = set(), options.adapt
         if unknown := [key for key in asked if key not in SWEPT]:
             fail(f"--method sweep has no error of {', '.join(map(short, unknown))}; it has {', '.join(map(short, SWEPT))}")
 
@@ -94,7 +112,9 @@ class Goal:
                 "-error_estimate_numbers", ",".join(SWEPT[key] for key in self.asked)]
 
     def mesh(self, choice):
-        if choice.mesh:
+        if self.outcomes and replace(choice, dt=self.last.choice.dt, scheme=self.last.choice.scheme) == self.last.choice:
+            return self.last.mesh
+        if choice.mesh and not choice.field:
             return choice.mesh
         folder = self.options.results / "meshes"
         if not choice.field:
@@ -105,7 +125,8 @@ class Goal:
         cells = round(self.last.cells * (self.last.choice.size / choice.size) ** 3)
         path = folder / f"goal_{Path(choice.field).parent.parent.name}_{cells}.msh"
         with settings.Clock(self.options.clock) as clock:
-            make_mesh(path, "lung_mesh", ["--side", "both", "--size-field", choice.field, "--cells", cells])
+            start = ["--refine", self.last.mesh] if choice.mesh else ["--side", "both"]
+            make_mesh(path, "lung_mesh", [*start, "--size-field", choice.field, "--cells", cells])
         self.spent += clock.seconds
         return path
 
@@ -206,11 +227,11 @@ class Goal:
         """The cheapest choice that promises what is asked, or else the one that comes nearest to it; None: the budget has none."""
         now = self.last.choice
         field = ""
-        if not now.mesh and self.options.adapt:
+        if self.adapt:
             field = str(self.last.run["folder"] / "run" / "errors.xdmf")
         found = []
         for finer in (1, *FINER, 0.4, 0.3, 0.25):
-            if now.mesh:
+            if now.mesh and not self.adapt:
                 level = round(-math.log2(finer))
                 if abs(2.0 ** -level - finer) > 1e-9:
                     continue
@@ -239,12 +260,12 @@ class Goal:
 
     def solve(self):
         """Runs until the bars are within what is asked, or the budget is used. False: no sweep is possible here."""
-        self.made = set()
         o = self.options
         dt = o.dt or max(FIRST_STEP, float(settings.of_files([*self.scene, *o.flags], "-ts_dt", "0")))
         if o.meshes or settings.of_files([*self.scene, *o.flags], "-dm_plex_filename") and not o.lung:
             path = str((o.meshes or [settings.of_files([*self.scene, *o.flags], "-dm_plex_filename")])[0])
             choice = Choice(1.0, dt, mesh=path)
+            self.adapt = self.adapt and can_be_cut(path)
         else:
             choice = Choice(max(o.lung or [FIRST_SIZE]), dt)
         while self.attempt(choice):
