@@ -14,7 +14,8 @@ from .numbers import SHORT, file_name, percent, short
 
 FIRST_SIZE = 30                 # mm, of the built-in lungs
 FIRST_STEP = 0.05               # s
-FINER = (0.9, 0.75, 0.6, 0.5)   # what sizes of cells and steps may be changed by at once
+FINER = (0.9, 0.82, 0.75, 0.68, 0.62, 0.56, 0.5, 0.45, 0.4, 0.35, 0.3, 0.25)  # what sizes of cells may be changed by at once
+SHORTER = (0.9, 0.75, 0.6, 0.5, 0.35, 0.25, 0.18, 0.125)                       # and steps
 ORDER_IN_SPACE = 1.5            # of a number in the size of the cells, until two meshes tell
 ORDERS_BELIEVED = (1.0, 3.0)    # what two meshes may tell
 ROWS, BDF2 = 1.0, 0.3           # order of the sums over rows; share of the steps' part that BDF2 leaves at first
@@ -230,7 +231,7 @@ class Goal:
         if self.adapt:
             field = str(self.last.run["folder"] / "run" / "errors.xdmf")
         found = []
-        for finer in (1, *FINER, 0.4, 0.3, 0.25):
+        for finer in (1, *FINER):
             if now.mesh and not self.adapt:
                 level = round(-math.log2(finer))
                 if abs(2.0 ** -level - finer) > 1e-9:
@@ -238,7 +239,7 @@ class Goal:
                 there = replace(now, refined=now.refined + level, size=now.size * finer)
             else:
                 there = replace(now, size=now.size * finer, field=field if finer < 1 else now.field)
-            for shorter in (1, *FINER, 0.35, 0.25, 0.18, 0.125):
+            for shorter in (1, *SHORTER):
                 for scheme in dict.fromkeys((now.scheme, "bdf")):
                     choice = replace(there, dt=now.dt * shorter, scheme=scheme)
                     if choice != now:

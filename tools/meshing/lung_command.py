@@ -25,6 +25,7 @@ DEFAULT_VOLUME = {"right": 1404.0, "left": 1196.0, "both": 2600.0}  # ml
 DEFAULT_SIZE = 15.0     # mm, in a lung of the default volume
 AIRWAY_SIZE = {"hilum": 8.0, "main": 3.0, "lobar": 4.0}  # mm, likewise
 LUNG_VOLUMES = (1e-3, 1e7)  # ml, of any animal
+FOLLOWED = 0.85         # of the sizes of a size field: with these gmsh makes about as many cells as the field asks for
 TET = 0.118             # volume of a tetrahedron over that of the cube of its edge
 
 
@@ -208,7 +209,7 @@ def adapted(options, path, cells):
     cells = cells or len(field.tets)
     sizes = field.sizes(cells)
     return with_cells(cells, lambda factor: make_lungs(
-        replace(options, wanted=(field.points, field.tets, factor * sizes))))
+        replace(options, wanted=(field.points, field.tets, FOLLOWED * factor * sizes))))
 
 
 def mesh_of(given, options):

@@ -16,6 +16,7 @@ EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 SAME = 1e-12            # share by which no volume and no area may change
 ALIKE = 1e-2            # share by which the body of a size field may differ from the mesh
 REGULAR = 6 * math.sqrt(2)  # cube of the edge of a regular tetrahedron over its volume
+MISS = 0.05             # share by which a number of cells may be missed
 STEP = 2 ** (1 / 3)     # what one cut changes the size of a cell by
 FLATTER = 0.5           # share of the worst cell's SICN that cuts have to leave, where it is below MIN_SICN
 
@@ -118,12 +119,17 @@ def until_small(mesh, wanted):
 
 def until_many(mesh, wanted, cells):
     """The Mesh cut where it is largest over the sizes wanted of its cells (m,) until it has about so many."""
-    while len(mesh.tets) < 0.97 * cells:
+    takes = 4.0  # new cells of one that is marked, with its neighbours
+    while len(mesh.tets) < (1 - MISS) * cells:
         ratio = sizes(mesh) / wanted
-        left = max(1, round((cells - len(mesh.tets)) / 3))  # a cut takes its neighbours along
-        least = max(np.sort(ratio)[-min(left, len(ratio))], ratio.max() / STEP)
-        mesh, parent = bisected(mesh, ratio >= least)
-        wanted = wanted[parent]
+        many = min(max(1, round((cells - len(mesh.tets)) / takes)), len(ratio))
+        worst = np.argpartition(ratio, -many)[-many:]
+        marked = np.zeros(len(ratio), dtype=bool)
+        marked[worst[ratio[worst] >= ratio.max() / STEP]] = True
+        finer, parent = bisected(mesh, marked)
+        takes = max(1.0, (len(finer.tets) - len(mesh.tets)) / marked.sum())
+        if len(finer.tets) <= (1 + MISS) * cells or many == 1:
+            mesh, wanted = finer, wanted[parent]
     return mesh
 
 
