@@ -157,10 +157,13 @@ class Goal:
 
     def geometry(self, key):
         """What the shape of the cells' facets makes a number wrong by: meshes that follow the body anew differ in it, and their corrected
-        values in nothing else. Of order 2; 0 for a mesh from a file, whose facets are the body; infinite after one mesh."""
-        if self.last.choice.mesh:
-            return 0.0
+        values in nothing else. Of order 2; infinite after one mesh. Of a mesh from a file the facets are the body; but by what the
+        corrected value of the mesh before differs, if that was resolved, the estimates that cells are cut by may be off."""
         now = self.last
+        if now.choice.mesh:
+            before = next((o for o in reversed(self.outcomes[:-1]) if o.choice.size > 1.05 * now.choice.size), None)
+            told = now.choice.field and before and before.parts[key]["corrected"] is not None
+            return abs(now.corrected(key) - before.corrected(key)) if told else 0.0
         before = next((o for o in reversed(self.outcomes[:-1]) if o.choice.size > 1.05 * now.choice.size), None)
         if not before:
             return math.inf

@@ -140,10 +140,10 @@ def check_refine(given):
     for option in ("side", "volume", "airway", "airway_size", "bronchus_radius"):
         if getattr(given, option):
             raise MeshError(f"--{option.replace('_', '-')} has no meaning with --refine: the mesh keeps its shape and its names.")
-    if not (given.size or given.cells or given.size_field):
-        raise MeshError("--refine needs to know where: give --size, --size with --near, --cells or --size-field.")
     if given.near and (not given.size or given.size_field):
         raise MeshError("--near needs the --size of the cells there, and no --size-field.")
+    if not (given.size or given.cells or given.size_field):
+        raise MeshError("--refine needs to know where: give --size, --size with --near, --cells or --size-field.")
     if given.size and given.size_field:
         raise MeshError("--size has no meaning with --size-field; give --cells.")
     if os.path.exists(given.output) and os.path.exists(given.refine) and os.path.samefile(given.refine, given.output):

@@ -111,10 +111,13 @@ def halves(cells, which, first, second, middle):
 
 def until_small(mesh, wanted):
     """The Mesh cut until each cell has the size wanted(mesh), as near as halves come to it."""
-    while (large := sizes(mesh) > STEP ** 0.5 * wanted(mesh)).any():
+    while True:
+        ratio = sizes(mesh) / wanted(mesh)
+        enough_memory(np.maximum(ratio ** 3, 1).sum())
+        large = ratio > STEP ** 0.5
+        if not large.any():
+            return mesh
         mesh, _ = bisected(mesh, large)
-        enough_memory(len(mesh.tets))
-    return mesh
 
 
 def until_many(mesh, wanted, cells):
