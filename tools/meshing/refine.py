@@ -6,7 +6,7 @@ from scipy import spatial
 
 from .foreign import mesh_of
 from .formats import read_raw
-from .geometry import facet_areas, tet_volumes, triangle_edges
+from .geometry import boundary_facets, facet_areas, tet_volumes, triangle_edges
 from .mesh import Mesh, MeshError, enough_memory
 from .quality import MIN_SICN, dihedral_angles, sicn
 from .size_field import read_size_field
@@ -174,9 +174,10 @@ def quality(mesh):
 
 
 def contents(mesh):
-    """{name of a surface or volume and its tag: area or volume}, and the whole volume."""
+    """{name of a surface or volume and its tag: area or volume}, and the whole volume and boundary."""
     areas, volumes = facet_areas(mesh.points, mesh.facets), tet_volumes(mesh.points, mesh.tets)
-    return {"the whole": volumes.sum()} | {
+    boundary = facet_areas(mesh.points, boundary_facets(mesh.tets)).sum()
+    return {"the whole volume": volumes.sum(), "the whole boundary": boundary} | {
         f"{name} ({'surface' if dimension == 2 else 'volume'} {tag})": (areas[mesh.surfaces == tag] if dimension == 2 else
                                                                         volumes[mesh.regions == tag]).sum()
         for (dimension, tag), name in mesh.names.items()}
