@@ -20,7 +20,27 @@ constexpr double swept_factor = 1.5, corrected_share = 1. / 3, largest_part = 0.
 /// share below the second of a number that is prescribed stays rounding.
 constexpr double worthless = 3, plain = 1e-6;
 
+struct Reason {
+  const char *key, *words;
+};
+
+/// In the order of Unresolved.
+constexpr Reason reasons[] = {{"phase_ended_early", "phases ended by a trigger or by cycling"},
+                              {"few_steps_in_a_phase", "steps too long for its phases"},
+                              {"steps_too_long", "steps too long"},
+                              {"cells_too_large", "cells too large"}};
+
 } // namespace
+
+const char *key_of(Unresolved reason)
+{
+  return reasons[static_cast<int>(reason)].key;
+}
+
+const char *words_of(Unresolved reason)
+{
+  return reasons[static_cast<int>(reason)].words;
+}
 
 double space_share(const ClinicalEntry &entry, const LackingParts &parts)
 {
@@ -29,7 +49,7 @@ double space_share(const ClinicalEntry &entry, const LackingParts &parts)
 }
 
 ErrorBar lacking_bar(const ClinicalEntry &entry, const LackingParts &parts, double largest_share,
-                     const std::string &trouble_in_time)
+                     std::optional<Unresolved> trouble_in_time)
 {
   const double value = *entry.value, time = std::abs(parts.steps) + std::abs(parts.rows),
                space = space_share(entry, parts);
@@ -38,16 +58,16 @@ ErrorBar lacking_bar(const ClinicalEntry &entry, const LackingParts &parts, doub
   bar.entry = entry;
   bar.lacks = parts;
   bar.solver = std::abs(parts.solver);
-  if (!trouble_in_time.empty())
-    bar.unresolved = trouble_in_time;
+  if (trouble_in_time)
+    bar.unresolved.push_back(*trouble_in_time);
   else if (!(time <= largest_part * std::abs(value)))
-    bar.unresolved = "steps too long";
+    bar.unresolved.push_back(Unresolved::steps_too_long);
   else
     bar.time = swept_factor * time;
   if (space <= largest_part && (largest_share <= worthless || space < plain))
     bar.space = swept_factor * (1 + std::min(1., largest_share)) * space * std::abs(value);
   else
-    bar.unresolved += (bar.unresolved.empty() ? "" : ", ") + std::string("cells too large");
+    bar.unresolved.push_back(Unresolved::cells_too_large);
   if (!bar.total()) return bar;
   bar.corrected =
       value + parts.steps + parts.rows + parts.solver + (parts.flow_in_space + parts.tissue_in_space) / seen_by_richer;
@@ -74,6 +94,13 @@ double space_error(double difference, double ratio)
 std::optional<double> ErrorBar::total() const
 {
   return time && space && solver ? std::optional<double>(*time + *space + *solver) : std::nullopt;
+}
+
+std::string ErrorBar::unresolved_words() const
+{
+  std::string all;
+  for (Unresolved reason : unresolved) all += (all.empty() ? "" : ", ") + std::string(words_of(reason));
+  return all;
 }
 
 double ErrorReport::extra_seconds() const

@@ -175,7 +175,9 @@ Json errors_json(const ErrorReport &report)
     if (!bar.lacks) continue;
     number["corrected"] = optional_json(bar.corrected);
     number["corrected_error"] = optional_json(bar.corrected_error);
-    number["not_resolved"] = bar.unresolved.empty() ? Json(nullptr) : Json(bar.unresolved);
+    number["not_resolved"] = bar.unresolved.empty() ? Json(nullptr) : Json(bar.unresolved_words());
+    number["not_resolved_because"] = Json::array();
+    for (Unresolved reason : bar.unresolved) number["not_resolved_because"].push_back(key_of(reason));
     number["lacks"] = {{"steps", bar.lacks->steps},
                        {"rows", bar.lacks->rows},
                        {"flow_in_space", bar.lacks->flow_in_space},

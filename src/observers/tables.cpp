@@ -206,7 +206,7 @@ PetscErrorCode print_error_bars(MPI_Comm comm, const ErrorReport &report)
   PetscCall(PetscPrintf(comm, "\n%-52s %9s %9s %9s%s\n", "Numerical errors (docs/accuracy/error_bars.md)", "time",
                         "space", "solver", swept ? "   corrected" : ""));
   for (const ErrorBar &bar : report.bars) {
-    std::string rest = bar.unresolved.empty() ? "" : "   not resolved: " + bar.unresolved;
+    std::string rest = bar.unresolved.empty() ? "" : "   not resolved: " + bar.unresolved_words();
     if (bar.corrected) {
       char text[64];
       std::snprintf(text, sizeof(text), "   %.4g ± %.2g", *bar.corrected, *bar.corrected_error);

@@ -41,9 +41,6 @@ enum { fine, other, twice, four_times, tight, n_levels };
 /// What each step leaves undone may add up, and the solver is judged by runs of so many times fewer steps.
 constexpr double steps_saved = 4;
 
-/// A phase that one of these ends does so with a step, up to one late, and no part in time sees that.
-constexpr char ends_with_a_step[] = "phases ended by a trigger or by cycling";
-
 std::string text_of(double v)
 {
   std::ostringstream s;
@@ -58,7 +55,8 @@ double cell_size_ratio(const ErrorLevel &level, const ErrorLevel &other)
   return std::cbrt(other.volume / static_cast<double>(other.cells) / (level.volume / static_cast<double>(level.cells)));
 }
 
-/// Whether a condition may have ended a phase of the run before its time.
+/// Whether a condition may have ended a phase of the run before its time: it does so with a step, up to one late, and
+/// no part in time sees that.
 bool ended_early(const Scene &scene, const std::vector<SignalRow> &rows)
 {
   const Programme &programme = *scene.facts().ventilator;
@@ -368,7 +366,7 @@ PetscErrorCode ErrorEstimate::make(const Options &options, const Output &output,
   const bool early = ended_early(scene, simulation.rows()),
              longer = !early && coarser(fine, twice) && coarser(twice, four_times);
   if (early && levels[twice].failure.empty())
-    levels[twice].failure = std::string("no error in time: ") + ends_with_a_step +
+    levels[twice].failure = std::string("no error in time: ") + words_of(Unresolved::phase_ended_early) +
                             " end up to a step late; a run with a smaller -ts_dt tells";
   else if (!longer && levels[twice].failure.empty() && levels[four_times].failure.empty())
     levels[twice].failure = "its steps are hardly longer, as the phases are too short for that: no error in time; a "
@@ -447,7 +445,11 @@ PetscErrorCode ErrorEstimate::make_by_sweep(const Options &options, const Scene 
   const bool early = ended_early(scene, simulation.rows());
   for (std::size_t k = 0; k < asked; ++k) {
     const bool resolved = functionals[k].resolved && parts.rough_in_time(k) <= guessed * std::abs(*entries[k].value);
-    const std::string trouble = early ? ends_with_a_step : resolved ? "" : "steps too long for its phases";
+    std::optional<Unresolved> trouble;
+    if (early)
+      trouble = Unresolved::phase_ended_early;
+    else if (!resolved)
+      trouble = Unresolved::few_steps_in_a_phase;
     report.bars.push_back(lacking_bar(entries[k], parts.lacking()[k], largest_share, trouble));
     report.bars.back().more_breaths = periodicity.change(functionals[k], k);
   }

@@ -2,6 +2,7 @@
 """tools/accuracy_cost: limits and their uncertainty, errors of fields, the order of the runs, the budget, the answers."""
 import argparse
 import csv
+import json
 import os
 import pathlib
 import re
@@ -386,6 +387,10 @@ class Tool(unittest.TestCase):
             self.assertLessEqual(bar, share * value)
             self.assertLessEqual(abs(value - fine[key]), bar + 0.01 * fine[key])  # that has errors of its own
         self.assertGreater(first.stdout.count("left\n"), 1, "the first run does not meet it")
+        self.assertIn("cells cut to", first.stdout)
+        reasons = [number["not_resolved_because"] for path in folder.glob("runs/*/run/summary.json")
+                   for number in json.loads(path.read_text())["error_estimate"]["numbers"].values()]
+        self.assertTrue(reasons and all(reason == [] for reason in reasons), reasons)
         run = pulmo.finished(pulmo.PCV + SCENE + ["-options_file", str(folder / "recommended_2percent.opts")])
         self.assertEqual(run.json()["error_estimate"]["method"], "sweep")
         again = tool(*call)

@@ -372,6 +372,7 @@ class SweptErrors(unittest.TestCase):
         bar = bars(pc.finished(scene + STEPS + SWEEP))["peak_expiratory_flow_ml_per_s"]
         self.assertIsNone(bar["time"])
         self.assertIn("steps too long", bar["not_resolved"])
+        self.assertIn("few_steps_in_a_phase", bar["not_resolved_because"])
 
     def test_a_sweep_that_fails(self):
         """Linear systems that are not solved: the reason, and no bars of the steps that were."""
@@ -393,6 +394,8 @@ class SweptErrors(unittest.TestCase):
             case = pc.finished(air + pc.programme(text.format(30)) + STEPS + method)
             for key in ("tidal_volume_ml", "compliance_ml_per_cmH2O"):
                 self.assertIsNone(bars(case)[key]["time"])
+                if method is SWEEP:
+                    self.assertIn("phase_ended_early", bars(case)[key]["not_resolved_because"])
                 self.assertIsNone(bars(case)[key]["error"])
             self.assertIn("phases ended by a trigger or by cycling", case.out)
         late = bars(pc.finished(air + pc.programme(text.format(0.01)) + STEPS + SWEEP))["tidal_volume_ml"]
@@ -425,6 +428,7 @@ class SweptErrors(unittest.TestCase):
         for key in ("resistance_cmH2O_s_per_l", "compliance_ml_per_cmH2O"):
             self.assertIsNone(bars(case)[key]["space"])
             self.assertIn("cells too large", bars(case)[key]["not_resolved"])
+            self.assertIn("cells_too_large", bars(case)[key]["not_resolved_because"])
         self.assertIsNotNone(bars(case)["peak_inspiratory_pressure_cmH2O"]["error"], "prescribed")
         alone = bars(pc.finished(scene + ["-ts_dt", "0.1", "-ventilator_pip", "4"] + SWEEP + ["-error_estimate_numbers", "C_rs"]))
         self.assertEqual(list(alone), ["compliance_ml_per_cmH2O"])

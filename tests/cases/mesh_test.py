@@ -1,15 +1,23 @@
 #!/usr/bin/python3
 """A mesh is its cells and its names: however a file writes them, the signals are the same to the last digit."""
+import contextlib
+import io
 import itertools
+import os
 import re
+import sys
 import unittest
 
 import gmsh
+import h5py
 import meshio
 import numpy as np
 
 import case_meshes
 import pulmo_case as pulmo
+
+sys.path.insert(0, os.path.join(pulmo.SOURCE, "tools"))
+from meshing import lung_command  # noqa: E402
 
 SCENE = pulmo.DIRECT + pulmo.PCV + ["-ventilator_pip", "3"]
 FLAVOURS = [(2.2, False), (2.2, True), (4.1, False), (4.1, True)]
@@ -321,6 +329,148 @@ class Distribution(unittest.TestCase):
                     areas = case.json()["surface_areas_mm2"]
                     self.assertAlmostEqual(areas["airway"], airway, places=9)
                     self.assertAlmostEqual(areas["pleura"], pleura, places=9)
+
+
+def lung_mesh(*words):
+    """Exit code of tools/lung_mesh and all that it says."""
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        try:
+            code = lung_command.main([str(word) for word in words])
+        except SystemExit as end:
+            code = end.code
+    return code, said.getvalue()
+
+
+class Read:
+    """A mesh file as meshio reads it, and the worst mean ratio of its cells (Liu & Joe), 1 for a regular one."""
+
+    def __init__(self, path):
+        with contextlib.redirect_stdout(io.StringIO()):  # meshio prints empty lines
+            mesh = meshio.read(path)
+        tags = mesh.cell_data_dict["gmsh:physical"]
+        self.points, self.tets, self.facets = mesh.points, mesh.cells_dict["tetra"], mesh.cells_dict["triangle"]
+        self.names = {name: tuple(key) for name, key in mesh.field_data.items()}
+        a, b, c = (self.points[self.facets[:, i]] for i in range(3))
+        self.areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+        self.volumes = np.abs(np.linalg.det(self.points[self.tets[:, 1:]] - self.points[self.tets[:, :1]])) / 6
+        self.content = {name: (self.areas[tags["triangle"] == tag] if dimension == 2 else self.volumes[tags["tetra"] == tag]).sum()
+                        for name, (tag, dimension) in self.names.items()}
+        self.nodes_of = {name: np.unique(self.facets[tags["triangle"] == tag]) for name, (tag, dimension) in self.names.items() if dimension == 2}
+        self.whole_faces = {tuple(face) for face in np.sort(self.facets, axis=1)}
+        pairs = np.array(list(itertools.combinations(range(4), 2)))
+        edges = self.points[self.tets[:, pairs[:, 0]]] - self.points[self.tets[:, pairs[:, 1]]]
+        self.worst = (12 * (3 * self.volumes) ** (2 / 3) / np.sum(edges ** 2, axis=(1, 2))).min()
+
+    def faces(self):
+        """Faces of all tetrahedra, and how many of these each belongs to."""
+        return np.unique(np.sort(self.tets[:, list(itertools.combinations(range(4), 3))], axis=2).reshape(-1, 3), axis=0, return_counts=True)
+
+
+SWEPT = ["-dm_plex_filename", pulmo.mesh("cube_lung.msh"), "-ventilator_inspiration", "0.4", "-ventilator_ramp_down", "0.1",
+         "-ventilator_expiration", "0.4", "-error_estimate", "-error_estimate_method", "sweep", "-error_estimate_numbers", "V_T"]
+
+
+class Refined(unittest.TestCase):
+    """tools/lung_mesh --refine: finer cells of any mesh, held against what meshio reads."""
+
+    def same_body(self, coarse, fine):
+        self.assertEqual(fine.names, coarse.names)
+        for name, content in coarse.content.items():
+            self.assertLessEqual(abs(fine.content[name] / content - 1), 1e-12, name)
+        faces, times = fine.faces()
+        self.assertLessEqual(times.max(), 2)
+        self.assertTrue({tuple(face) for face in faces[times == 1]} <= fine.whole_faces, "boundary without a name, or hanging nodes")
+        self.assertTrue(fine.whole_faces <= {tuple(face) for face in faces})
+
+    def walled(self):
+        """The cube of two volumes, the faces between which have a name; in another unit, far from the origin."""
+        parts = Parts()
+        left = parts.points[parts.cells].mean(axis=1)[:, 0] < 5
+        parts.cell_names = [["left" if side else "right"] for side in left]
+        faces = np.sort(parts.cells[:, list(itertools.combinations(range(4), 3))], axis=2)
+        shared = {tuple(f) for f in faces[left].reshape(-1, 3)} & {tuple(f) for f in faces[~left].reshape(-1, 3)}
+        parts.facets = np.concatenate([parts.facets, np.array(sorted(shared))])
+        parts.facet_names += [["wall"]] * len(shared)
+        parts.points = parts.points + [20, -30, 40]
+        return parts.write(TAGS | {(2, "wall"): 7, (3, "left"): 4, (3, "right"): 9}, names={
+            (2, 1): "airway", (2, 2): "pleura", (2, 7): "wall", (3, 4): "left", (3, 9): "right"})
+
+    def test_round_after_round(self):
+        """Six rounds from file to file: names and shape stay, cells follow --near, and none gets flat."""
+        path = self.walled()
+        first = before = Read(path)
+        for number, (version, binary) in enumerate([*FLAVOURS, *FLAVOURS[:2]]):
+            size, made = 2.4 / 1.5 ** number, pulmo.scratch("refined.msh")
+            code, said = lung_mesh("--refine", path, "--near", "airway", "--size", size, "--format", version, "--binary" if binary else "--ascii",
+                                   "--output", made)
+            self.assertEqual(code, 0, said)
+            now = Read(made)
+            self.same_body(first, now)
+            at = np.isin(now.tets, now.nodes_of["airway"]).any(axis=1)
+            self.assertLess((now.volumes[at] * 6 * 2 ** 0.5).max() ** (1 / 3), 2 * size)  # larger ones have their centre further away
+            self.assertGreater(len(now.tets), len(before.tets))
+            np.testing.assert_allclose(now.points[now.nodes_of["airway"], 0], 30, atol=1e-12)
+            self.assertIn(f"{len(now.tets)}, before {len(before.tets)}", said)
+            path, before = made, now
+        print(f"{len(first.tets)} to {len(now.tets)} cells, worst mean ratio {first.worst:.3f} to {now.worst:.3f}")
+        self.assertGreater(now.worst, 0.5 * first.worst)
+        far = now.points[now.tets].mean(axis=1)[:, 0] < 22
+        self.assertGreater(now.volumes[far].mean(), 100 * now.volumes[~far].min())
+
+    def test_a_lung_everywhere(self):
+        made = pulmo.scratch("refined.msh")
+        code, said = lung_mesh("--refine", pulmo.mesh("lung_test.msh"), "--cells", 5000, "--output", made)
+        self.assertEqual(code, 0, said)
+        coarse, fine = Read(pulmo.mesh("lung_test.msh")), Read(made)
+        self.same_body(coarse, fine)
+        self.assertAlmostEqual(len(fine.tets) / 5000, 1, delta=0.1)
+        self.assertGreater(fine.worst, 0.5 * coarse.worst)
+
+    def test_by_errors(self):
+        """Cells are cut where V_T lacks most, also if the file has another unit than the run; the program finds the same lung."""
+        coarse = pulmo.finished(SCENE + SWEPT)
+        errors, points = coarse.path("errors.xdmf"), meshio.read(pulmo.mesh("cube_lung.msh")).points
+        for scale in 1, 1e-3:
+            path, made = case_meshes.scaled("cube_lung.msh", scale)[1], pulmo.scratch("refined.msh")
+            code, said = lung_mesh("--refine", path, "--size-field", errors, "--cells", 400, "--output", made)
+            self.assertEqual(code, 0, said)
+            self.same_body(Read(path), Read(made))
+            fine = short_run(made, ["-mesh_scale", f"{1 / scale:g}"])
+            self.assertAlmostEqual(fine.json()["cells"], 400, delta=40)
+            for name, area in coarse.json()["surface_areas_mm2"].items():
+                self.assertAlmostEqual(fine.json()["surface_areas_mm2"][name] / area, 1, places=12)
+        with h5py.File(coarse.path("fields.h5")) as mesh, h5py.File(coarse.path("errors.h5")) as file:
+            x, cells = mesh["geometry"][:], mesh["topology"][:].reshape(-1, 10)
+            error = np.abs(file["lacks_in_space_tidal_volume_ml"][:])
+        self.assertEqual(len(points), len(np.unique(cells[:, :4])))
+        mesh = meshio.read(made)
+        centres = mesh.points[mesh.cells_dict["tetra"]].mean(axis=1) / scale
+        nearest = np.linalg.norm(x[cells[:, :4]].mean(axis=1)[:, None] - centres, axis=2).argmin(axis=1)
+        volumes = [np.abs(np.linalg.det(p[t[:, 1:4]] - p[t[:, :1]])) for p, t in ((x, cells), (mesh.points / scale, mesh.cells_dict["tetra"]))]
+        change = volumes[1][nearest] / volumes[0]
+        self.assertLess(change[error > np.quantile(error, 0.9)].mean(), 0.5 * change[error < np.quantile(error, 0.3)].mean())
+
+    def test_refuses(self):
+        cube, made = pulmo.mesh("cube_lung.msh"), pulmo.scratch("made.msh")
+        own = case_meshes.scaled("cube_lung.msh", 1)[1]
+        twice = in_gmsh("cube_lung.msh", lambda: gmsh.model.addPhysicalGroup(3, [gmsh.model.getEntities(3)[0][1]], 77), 4.1, False)
+        second = in_gmsh("cube_lung.msh", lambda: gmsh.model.mesh.setOrder(2), 4.1, False)
+        errors = pulmo.finished(SCENE + SWEPT).path("errors.xdmf")
+        for words, said in (([cube], "--refine needs"), ([cube, "--near", "airway"], "--size of the cells"), ([cube, "--near", "wall", "--size", 1], "airway, pleura"),
+                            ([cube, "--cells", 50], "--cells 50"), ([cube, "--cells", 10 ** 9], "GB"), ([cube, "--size", 1, "--side", "left"], "--side"),
+                            ([cube, "--size", 0.001], "GB"),
+                            ([own, "--size", 1, "--output", own], "--output"), (["none.msh", "--size", 1], "none.msh"), ([twice, "--size", 1], "2 groups"),
+                            ([second, "--size", 1], "higher order"), ([pulmo.mesh("column.msh"), "--size-field", errors], "another body"),
+                            ([cube, "--size-field", "none.xdmf"], "none.xdmf"), ([cube, "--size-field", errors, "--size", 1], "--size "),
+                            ([cube, "--size", 1, "--check", cube], "--check")):
+            with self.subTest(words=words):
+                code, text = lung_mesh("--output", made, "--refine", *words)
+                self.assertNotEqual(code, 0)
+                self.assertIn(said, text)
+                self.assertFalse(os.path.exists(made))
+        code, text = lung_mesh("--near", "airway", "--output", made)
+        self.assertIn("--near has no meaning without --refine", text)
 
 
 if __name__ == "__main__":

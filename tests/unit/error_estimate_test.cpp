@@ -75,7 +75,7 @@ TEST(LackingBar, CountsPartsThatMayCancelApart)
   parts.flow_in_space = -6;
   parts.tissue_in_space = 3;
   parts.solver = -0.5;
-  const ErrorBar bar = lacking_bar(entry, parts, 0.2, "");
+  const ErrorBar bar = lacking_bar(entry, parts, 0.2, {});
   EXPECT_NEAR(*bar.time, 1.5 * 4, 1e-12);
   EXPECT_NEAR(*bar.space, 1.2 * 1.5 * 9 / 0.75, 1e-12);
   EXPECT_NEAR(*bar.solver, 0.5, 1e-12);
@@ -90,23 +90,25 @@ TEST(LackingBar, SaysWhatIsNotResolved)
   LackingParts parts;
   parts.flow_in_space = 40; // 53 of 500
   EXPECT_NEAR(space_share(entry, parts), 40 / 0.75 / 500, 1e-12);
-  ErrorBar bar = lacking_bar(entry, parts, 0.2, "");
+  ErrorBar bar = lacking_bar(entry, parts, 0.2, {});
   EXPECT_FALSE(bar.space);
   EXPECT_FALSE(bar.total());
   EXPECT_FALSE(bar.corrected);
-  EXPECT_EQ(bar.unresolved, "cells too large");
-  bar = lacking_bar(entry, parts, 0.2, "steps too long for its phases");
+  EXPECT_EQ(bar.unresolved_words(), "cells too large");
+  bar = lacking_bar(entry, parts, 0.2, Unresolved::few_steps_in_a_phase);
   EXPECT_FALSE(bar.time);
-  EXPECT_EQ(bar.unresolved, "steps too long for its phases, cells too large");
+  EXPECT_EQ(bar.unresolved_words(), "steps too long for its phases, cells too large");
+  EXPECT_STREQ(key_of(bar.unresolved.front()), "few_steps_in_a_phase");
+  EXPECT_STREQ(key_of(Unresolved::cells_too_large), "cells_too_large"); // the last one
   parts.flow_in_space = 4; // 1 %, but another number is off by several times itself
-  EXPECT_TRUE(lacking_bar(entry, parts, 3, "").space);
-  bar = lacking_bar(entry, parts, 3.1, "");
+  EXPECT_TRUE(lacking_bar(entry, parts, 3, {}).space);
+  bar = lacking_bar(entry, parts, 3.1, {});
   EXPECT_FALSE(bar.space);
-  EXPECT_EQ(bar.unresolved, "cells too large");
+  EXPECT_EQ(bar.unresolved_words(), "cells too large");
   parts.flow_in_space = 1e-12; // prescribed
-  EXPECT_TRUE(lacking_bar(entry, parts, 3.1, "").space);
+  EXPECT_TRUE(lacking_bar(entry, parts, 3.1, {}).space);
   parts.steps = std::nan("");
-  EXPECT_FALSE(lacking_bar(entry, parts, 0.2, "").time);
+  EXPECT_FALSE(lacking_bar(entry, parts, 0.2, {}).time);
 }
 
 } // namespace

@@ -57,8 +57,9 @@ def parse(words):
     parser.add_argument("--method", choices=["ladder", "sweep", "auto"], default="ladder", help=(
         "how a question is answered: by ladders; by the errors that one sweep back over each run tells, changing what is cheapest; or by "
         "sweeps where the scene lets them (default ladder)"))
-    parser.add_argument("--no-adapt", dest="adapt", action="store_false",
-                        help="with sweeps on built-in lungs: cells of one size, not by the errors of the run before")
+    parser.add_argument("--no-adapt", dest="adapt", action="store_false", help=(
+        "with sweeps: new meshes of built-in lungs have cells of one size, and a mesh from a file is refined as a whole (default: both by the "
+        "errors of the run before)"))
     parser.add_argument("--numbers", nargs="+", metavar="NAME", help="without a question: the numbers that have to be met (default: those of "
                         f"{' '.join(ALIASES)} that the scene has)")
     parser.add_argument("--meshes", type=Path, nargs="+", help="meshes of one body, coarse to fine")

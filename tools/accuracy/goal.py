@@ -14,7 +14,8 @@ from .numbers import SHORT, file_name, percent, short
 
 FIRST_SIZE = 30                 # mm, of the built-in lungs
 FIRST_STEP = 0.05               # s
-FINER = (0.9, 0.75, 0.6, 0.5)   # what sizes of cells and steps may be changed by at once
+FINER = (0.9, 0.82, 0.75, 0.68, 0.62, 0.56, 0.5, 0.45, 0.4, 0.35, 0.3, 0.25)  # what sizes of cells may be changed by at once
+SHORTER = (0.9, 0.75, 0.6, 0.5, 0.35, 0.25, 0.18, 0.125)                       # and steps
 ORDER_IN_SPACE = 1.5            # of a number in the size of the cells, until two meshes tell
 ORDERS_BELIEVED = (1.0, 3.0)    # what two meshes may tell
 ROWS, BDF2 = 1.0, 0.3           # order of the sums over rows; share of the steps' part that BDF2 leaves at first
@@ -28,12 +29,13 @@ MOST_RUNS = 12
 # corrected value over its parts, the largest share that is resolved
 SWEPT = {**SHORT, "plateau_pressure_cmH2O": "P_plat", "peak_expiratory_flow_ml_per_s": "Q_exp", "work_j": "work"}
 SEEN, FACTOR, LARGEST = 0.75, 0.5, 0.1
-EARLY = "by a trigger or by cycling"  # in what a sweep says of phases whose ends jump by whole steps
+EARLY, FEW = "phase_ended_early", "few_steps_in_a_phase"  # of "not_resolved_because" (pulmo/observers/error_bars.hpp)
 
 
 @dataclass(frozen=True)
 class Choice:
-    """A setting. size: of the cells, mm, or over that of a mesh from a file. field: errors.xdmf that they follow; mesh, refined: a file that is there."""
+    """A setting. size: of the cells, mm, or over that of a mesh from a file. field: errors.xdmf that they follow; mesh: a file that is there, or was
+    the first; refined: as a whole."""
     size: float
     dt: float
     scheme: str = "beuler"
@@ -43,8 +45,12 @@ class Choice:
 
     @property
     def name(self):
-        what = f"{Path(self.mesh).stem}{f' refined {self.refined} x' if self.refined else ''}" if self.mesh else (
-            f"size {self.size:.3g} mm" + (", by the errors of the run before" if self.field else ""))
+        if self.mesh:
+            what = Path(self.mesh).stem + (f" refined {self.refined} x" if self.refined else "") + (
+                f", cells cut to {self.size ** -3:.2g} times as many" if self.field else "")
+        else:
+            what = f"size {self.size:.3g} mm"
+        what += ", by the errors of the run before" if self.field else ""
         return f"{what} | {settings.Steps(self.scheme, self.dt).name}"
 
 
@@ -66,12 +72,25 @@ class Outcome:
         return part["value"] + lacks["steps"] + lacks["rows"] + lacks["solver"] + (lacks["flow_in_space"] + lacks["tissue_in_space"]) / SEEN
 
 
+def can_be_cut(path):
+    """Whether tools/lung_mesh --refine keeps all of a mesh; if not, says why."""
+    from meshing.mesh import MeshError  # gmsh takes its time
+    from meshing.refine import named_mesh
+    try:
+        named_mesh(path)
+    except MeshError as error:
+        print(f"finer meshes are {path} refined as a whole: {error}", flush=True)
+        return False
+    return True
+
+
 class Goal:
     """The search for a run whose corrected values have bars within what is asked: number -> share."""
 
     def __init__(self, asked, scene, options):
         self.asked, self.scene, self.options = asked, scene, options
         self.spent, self.outcomes, self.refused = 0.0, [], ""
+        self.made, self.adapt = set(), options.adapt
         if unknown := [key for key in asked if key not in SWEPT]:
             fail(f"--method sweep has no error of {', '.join(map(short, unknown))}; it has {', '.join(map(short, SWEPT))}")
 
@@ -94,7 +113,9 @@ class Goal:
                 "-error_estimate_numbers", ",".join(SWEPT[key] for key in self.asked)]
 
     def mesh(self, choice):
-        if choice.mesh:
+        if self.outcomes and replace(choice, dt=self.last.choice.dt, scheme=self.last.choice.scheme) == self.last.choice:
+            return self.last.mesh
+        if choice.mesh and not choice.field:
             return choice.mesh
         folder = self.options.results / "meshes"
         if not choice.field:
@@ -105,7 +126,8 @@ class Goal:
         cells = round(self.last.cells * (self.last.choice.size / choice.size) ** 3)
         path = folder / f"goal_{Path(choice.field).parent.parent.name}_{cells}.msh"
         with settings.Clock(self.options.clock) as clock:
-            make_mesh(path, "lung_mesh", ["--side", "both", "--size-field", choice.field, "--cells", cells])
+            start = ["--refine", self.last.mesh] if choice.mesh else ["--side", "both"]
+            make_mesh(path, "lung_mesh", [*start, "--size-field", choice.field, "--cells", cells])
         self.spent += clock.seconds
         return path
 
@@ -135,10 +157,13 @@ class Goal:
 
     def geometry(self, key):
         """What the shape of the cells' facets makes a number wrong by: meshes that follow the body anew differ in it, and their corrected
-        values in nothing else. Of order 2; 0 for a mesh from a file, whose facets are the body; infinite after one mesh."""
-        if self.last.choice.mesh:
-            return 0.0
+        values in nothing else. Of order 2; infinite after one mesh. Of a mesh from a file the facets are the body; but by what the
+        corrected value of the mesh before differs, if that was resolved, the estimates that cells are cut by may be off."""
         now = self.last
+        if now.choice.mesh:
+            before = next((o for o in reversed(self.outcomes[:-1]) if o.choice.size > 1.05 * now.choice.size), None)
+            told = now.choice.field and before and before.parts[key]["corrected"] is not None
+            return abs(now.corrected(key) - before.corrected(key)) if told else 0.0
         before = next((o for o in reversed(self.outcomes[:-1]) if o.choice.size > 1.05 * now.choice.size), None)
         if not before:
             return math.inf
@@ -186,7 +211,7 @@ class Goal:
         if math.isinf(geometry) and finer > TELLING:
             return math.inf
         geometry = 0 if math.isinf(geometry) else geometry * finer ** 2
-        if part["not_resolved"] and "for its phases" in part["not_resolved"] and shorter > 0.5:
+        if FEW in part["not_resolved_because"] and shorter > 0.5:
             return math.inf
         if max(time, space) > LARGEST * abs(value):
             return math.inf
@@ -206,18 +231,18 @@ class Goal:
         """The cheapest choice that promises what is asked, or else the one that comes nearest to it; None: the budget has none."""
         now = self.last.choice
         field = ""
-        if not now.mesh and self.options.adapt:
+        if self.adapt:
             field = str(self.last.run["folder"] / "run" / "errors.xdmf")
         found = []
-        for finer in (1, *FINER, 0.4, 0.3, 0.25):
-            if now.mesh:
+        for finer in (1, *FINER):
+            if now.mesh and not self.adapt:
                 level = round(-math.log2(finer))
                 if abs(2.0 ** -level - finer) > 1e-9:
                     continue
                 there = replace(now, refined=now.refined + level, size=now.size * finer)
             else:
                 there = replace(now, size=now.size * finer, field=field if finer < 1 else now.field)
-            for shorter in (1, *FINER, 0.35, 0.25, 0.18, 0.125):
+            for shorter in (1, *SHORTER):
                 for scheme in dict.fromkeys((now.scheme, "bdf")):
                     choice = replace(there, dt=now.dt * shorter, scheme=scheme)
                     if choice != now:
@@ -239,16 +264,16 @@ class Goal:
 
     def solve(self):
         """Runs until the bars are within what is asked, or the budget is used. False: no sweep is possible here."""
-        self.made = set()
         o = self.options
         dt = o.dt or max(FIRST_STEP, float(settings.of_files([*self.scene, *o.flags], "-ts_dt", "0")))
         if o.meshes or settings.of_files([*self.scene, *o.flags], "-dm_plex_filename") and not o.lung:
             path = str((o.meshes or [settings.of_files([*self.scene, *o.flags], "-dm_plex_filename")])[0])
             choice = Choice(1.0, dt, mesh=path)
+            self.adapt = self.adapt and can_be_cut(path)
         else:
             choice = Choice(max(o.lung or [FIRST_SIZE]), dt)
         while self.attempt(choice):
-            if any(EARLY in (self.last.parts[key]["not_resolved"] or "") for key in self.asked):
+            if any(EARLY in self.last.parts[key]["not_resolved_because"] for key in self.asked):
                 self.refused = "-error_estimate_method sweep has no error in time where a phase ends early; ladders may take over (--method ladder)"
                 return False
             if self.met() or len(self.outcomes) >= MOST_RUNS:

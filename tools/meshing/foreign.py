@@ -17,7 +17,8 @@ TRIANGLES = {2: 3, 9: 6, 21: 10}
 class Raw:
     """What a file holds: points, tetrahedra and triangles with the group of each (0: none), {(dimension, group): name}.
 
-    notes: what else there is to tell. refused: what pulmo would refuse of the file, though not of the Mesh made of it.
+    notes: what else there is to tell. refused: what pulmo would refuse of the file, though not of the Mesh made of it. lost: what
+    neither has room for.
     """
 
     points: np.ndarray
@@ -28,6 +29,7 @@ class Raw:
     names: dict
     notes: list = field(default_factory=list)
     refused: list = field(default_factory=list)
+    lost: list = field(default_factory=list)
 
 
 def read_msh(path):
@@ -38,7 +40,7 @@ def read_msh(path):
             points, row = gmsh_nodes()
         except Exception as error:  # gmsh raises bare Exceptions
             raise MeshError(f"{path} is no mesh that gmsh reads ({error}).") from error
-        names, notes, refused, parts = {}, [], [], {2: [], 3: []}
+        names, notes, refused, lost, parts = {}, [], [], [], {2: [], 3: []}
         for dimension, tag in gmsh.model.getPhysicalGroups():
             names[dimension, tag] = gmsh.model.getPhysicalName(dimension, tag) or str(tag)
         for dimension, kinds in ((2, TRIANGLES), (3, TETS)):
@@ -48,19 +50,22 @@ def read_msh(path):
                     said = f"are in {len(group)} groups (" + ", ".join(names[dimension, g] for g in group) + "), here counted with the first"
                     if dimension == 3:
                         notes.append(f"some cells {said}.")
+                        lost.append(f"some cells {said}")
                     else:
                         refused.append(f"some faces {said}; pulmo needs -mesh_prefer")
                 for kind, _, nodes in zip(*gmsh.model.mesh.getElements(dimension, entity)):
                     if kind not in kinds:
                         notes.append(f"elements that are no {'tetrahedra' if dimension == 3 else 'triangles'} are there (gmsh's type {kind}): "
                                      "left out.")
+                        lost.append(f"it has elements of gmsh's type {kind}, which are left out")
                         continue
                     if kinds[kind] != dimension + 1:
                         refused.append("elements are of higher order, here counted with their corners only; gmsh -order 1 saves straight ones")
                     cells = row[nodes.astype(int)].reshape(-1, kinds[kind])[:, :dimension + 1]
                     parts[dimension].append((cells, np.full(len(cells), group[0] if len(group) else 0)))
     raw = joined(points, parts, names, list(dict.fromkeys(notes)))
-    raw.refused = list(dict.fromkeys(refused))
+    raw.refused, raw.lost = list(dict.fromkeys(refused)), list(dict.fromkeys(lost))
+    raw.notes += [f"{name} names {'curves' if dimension == 1 else 'points'}: left out." for (dimension, _), name in names.items() if dimension < 2]
     return raw
 
 

@@ -60,7 +60,7 @@ def read_meshio(path):
         raise MeshError(f"{path} is no mesh that meshio reads ({why or type(error).__name__}).") from error
     whole = {name: data for name, data in read.cell_data.items() if all(is_whole(values) for values in data)}
     chosen = next((name for name in TAGS if name in whole), next(iter(whole)) if len(whole) == 1 else None)
-    notes = []
+    notes, lost = [], []
     if whole and chosen is None:
         notes.append(f"{path} holds several whole numbers for each cell ({', '.join(whole)}): none is taken for groups.")
     parts = {2: [], 3: []}
@@ -71,10 +71,13 @@ def read_meshio(path):
             parts[dimension].append((block.data, groups))
         elif block.type not in ("vertex", "line"):
             notes.append(f"elements that are no tetrahedra or triangles are there ({block.type}): left out.")
+            lost.append(f"it has elements of the kind {block.type}, which are left out")
     points = np.zeros((len(read.points), 3))
     points[:, :read.points.shape[1]] = read.points[:, :3]
     names = {(int(dimension), int(tag)): name for name, (tag, dimension) in read.field_data.items()}
-    return joined(points, parts, named_by_number(parts, names), list(dict.fromkeys(notes)))
+    raw = joined(points, parts, named_by_number(parts, names), list(dict.fromkeys(notes)))
+    raw.lost = list(dict.fromkeys(lost))
+    return raw
 
 
 def is_whole(values):

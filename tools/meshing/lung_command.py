@@ -12,10 +12,11 @@ from .check_command import check, with_whole_volume
 from .geometry import tet_volumes
 from .labels import EXAMPLE, PARTS
 from .lungs import SIDES, Options, make_lungs
-from .mesh import MeshError
+from .mesh import MeshError, enough_memory
 from .msh import write_mesh
 from .picture import picture
 from .quality_page import write_page
+from .refine import refined
 from .report import measures, print_report
 from .shape import BRONCHUS_RADIUS, TEMPLATE_VOLUME
 from .size_field import read_size_field
@@ -24,8 +25,8 @@ DEFAULT_VOLUME = {"right": 1404.0, "left": 1196.0, "both": 2600.0}  # ml
 DEFAULT_SIZE = 15.0     # mm, in a lung of the default volume
 AIRWAY_SIZE = {"hilum": 8.0, "main": 3.0, "lobar": 4.0}  # mm, likewise
 LUNG_VOLUMES = (1e-3, 1e7)  # ml, of any animal
+FOLLOWED = 0.85         # of the sizes of a size field: with these gmsh makes about as many cells as the field asks for
 TET = 0.118             # volume of a tetrahedron over that of the cube of its edge
-BYTES = 3000            # of memory that a tetrahedron takes on the way
 
 
 class Parser(argparse.ArgumentParser):
@@ -82,6 +83,11 @@ def parse(arguments):
                       f"(default: {DEFAULT_SIZE:g}; with --mask {mask_command.SIZE:g})")
     size.add_argument("--cells", type=count, metavar="N",
                       help="aim at N tetrahedra (within 10 %%) instead of a size")
+    cut = parser.add_argument_group("finer cells in a mesh that is there")
+    cut.add_argument("--refine", metavar="MESH", help=(
+        "cut cells of any mesh of tetrahedra through the middle of their longest edge; its names, its volume and its areas stay. Where: --size "
+        "(lengths are in the unit of the file), with --near; or --cells; or --size-field of a run on it (--cells: twice as many)"))
+    cut.add_argument("--near", metavar="NAME", help="with --refine: the --size holds at this named surface, and grows by 0.4 of the distance from it")
     parser.add_argument("--size-field", metavar="FILE.xdmf", help=(
         "let the sizes follow the errors of a run: errors.xdmf (-error_estimate), or fields.xdmf (-output_fields_error_indicator), on a "
         "mesh of the same lungs; as many tetrahedra as there unless --cells is given"))
@@ -120,12 +126,28 @@ def check_files(given):
 
 def check_route(given):
     """Refuses a command line that asks for two things at a time."""
-    routes = [option for option in ("mask", "surface", "check", "convert") if getattr(given, option)]
+    routes = [option for option in ("mask", "surface", "check", "convert", "refine") if getattr(given, option)]
     if len(routes) > 1:
         raise MeshError(f"--{routes[0]} and --{routes[1]} do not go together; give one.")
-    for option, needed in (("names", ("check", "convert")), ("labels", ("mask",)), ("rim_size", ("mask", "surface"))):
+    for option, needed in (("names", ("check", "convert")), ("labels", ("mask",)), ("rim_size", ("mask", "surface")),
+                           ("near", ("refine",))):
         if getattr(given, option) and not set(routes) & set(needed):
             raise MeshError(f"--{option.replace('_', '-')} has no meaning without --{' or --'.join(needed)}.")
+
+
+def check_refine(given):
+    """Refuses what --refine has no use for."""
+    for option in ("side", "volume", "airway", "airway_size", "bronchus_radius"):
+        if getattr(given, option):
+            raise MeshError(f"--{option.replace('_', '-')} has no meaning with --refine: the mesh keeps its shape and its names.")
+    if given.near and (not given.size or given.size_field):
+        raise MeshError("--near needs the --size of the cells there, and no --size-field.")
+    if not (given.size or given.cells or given.size_field):
+        raise MeshError("--refine needs to know where: give --size, --size with --near, --cells or --size-field.")
+    if given.size and given.size_field:
+        raise MeshError("--size has no meaning with --size-field; give --cells.")
+    if os.path.exists(given.output) and os.path.exists(given.refine) and os.path.samefile(given.refine, given.output):
+        raise MeshError(f"--output {given.output} is the mesh that --refine reads: give another name.")
 
 
 def check_request(given, volume, stretch):
@@ -141,10 +163,7 @@ def check_request(given, volume, stretch):
     if given.cells and not fewest <= given.cells <= most:
         raise MeshError(f"--cells {given.cells} is outside {fewest:.0f} to {most:.2g}, what a lung of any volume can be meshed with.")
     wanted = given.cells or volume * 1e3 / (TET * (given.size or DEFAULT_SIZE * stretch) ** 3)
-    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    if wanted * BYTES > memory:
-        raise MeshError(f"about {wanted:.2g} tetrahedra take {wanted * BYTES / 1e9:.2g} GB; this machine has {memory / 1e9:.2g} GB: "
-                            "take fewer.")
+    enough_memory(wanted)
 
 
 def filled_in(given):
@@ -190,7 +209,7 @@ def adapted(options, path, cells):
     cells = cells or len(field.tets)
     sizes = field.sizes(cells)
     return with_cells(cells, lambda factor: make_lungs(
-        replace(options, wanted=(field.points, field.tets, factor * sizes))))
+        replace(options, wanted=(field.points, field.tets, FOLLOWED * factor * sizes))))
 
 
 def mesh_of(given, options):
@@ -210,6 +229,12 @@ def made(given):
         failures = print_report(mesh, measures(mesh)) + mask_command.compare(mesh, source)
         mask_command.print_times(source)
         return mesh, failures, source.notes, source.mask
+    if given.refine:
+        check_refine(given)
+        mesh, notes = refined(given.refine, given.size, given.cells, given.near, given.size_field)
+        for note in notes:
+            print("note: " + note)
+        return with_whole_volume(mesh), [], notes, None
     mesh = mesh_of(given, filled_in(given))
     return mesh, print_report(mesh, measures(mesh)), [], None
 
@@ -249,7 +274,7 @@ def main(arguments):
         show(given, mesh, os.path.basename(given.output), failures, notes, mask)
         if failures:
             raise MeshError("; ".join(failures) + ", so no mesh was written.")
-        write_mesh(mesh, given.output, float(given.format), given.binary)
+        write_mesh(mesh, given.output, float(given.format), given.binary, digits=16 if given.refine else 6)
     except MeshError as error:
         print(f"lung_mesh: {error}", file=sys.stderr)
         return 1

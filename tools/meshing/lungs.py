@@ -1,4 +1,5 @@
 """Meshes of lungs: from the shape of each to its named surfaces, with exactly the volume asked for."""
+import functools
 import math
 from dataclasses import dataclass
 
@@ -31,10 +32,18 @@ class Options:
     wanted: tuple = ()  # nodes, tetrahedra and node sizes of another mesh that the sizes follow
 
 
+@functools.cache
+def shape_and_surface(side, airway, bronchus_radius):
+    """The Shape of a lung and its surface, the same for all sizes of cells."""
+    shape = lung_shape(side, airway, bronchus_radius)
+    return shape, iso_surface(shape)
+
+
 def make_lungs(options):
     """The Mesh asked for by the Options, with exactly the volume asked for."""
-    shapes = {side: lung_shape(side, options.airway, options.bronchus_radius) for side in SIDES[options.side]}
-    surfaces = {side: iso_surface(shape) for side, shape in shapes.items()}
+    shapes, surfaces = {}, {}
+    for side in SIDES[options.side]:
+        shapes[side], surfaces[side] = shape_and_surface(side, options.airway, options.bronchus_radius)
     scale = (options.volume * 1e3 / sum(enclosed_volume(*surface) for surface in surfaces.values())) ** (1 / 3)
     check_sizes(options, scale)
     lungs = [mesh_lung(side, shapes[side], surfaces[side], scale, options) for side in shapes]

@@ -1,7 +1,10 @@
 """A tetrahedral mesh whose surfaces and volumes have names."""
+import os
 from dataclasses import dataclass
 
 import numpy as np
+
+BYTES = 3000            # of memory that a tetrahedron takes on the way
 
 
 @dataclass
@@ -39,3 +42,11 @@ def merged(lungs):
 
 class MeshError(Exception):
     """A request that cannot be met, or a mesh that fails a check, in one sentence."""
+
+
+def enough_memory(cells):
+    """Refuses more tetrahedra than this machine has memory for."""
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    if cells * BYTES > memory:
+        raise MeshError(f"about {cells:.2g} tetrahedra take {cells * BYTES / 1e9:.2g} GB; this machine has {memory / 1e9:.2g} GB: "
+                        "take fewer.")

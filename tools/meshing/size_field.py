@@ -38,15 +38,15 @@ class SizeField:
             np.add.at(total, corner, volumes * wanted)
         return graded(self.points, self.tets, (total / weight) ** (-1 / 3))
 
-    def ratios(self, cells):
-        """Ratios of new to old size, in bounds, that make so many cells of the old ones.
+    def ratios(self, cells, largest=SIZE_CHANGE[1]):
+        """Ratios of new to old size, in bounds (largest: 1 where cells can only be cut), that make so many cells of the old ones.
 
         In place of an old cell there are f^-3 new ones, and its squared error e of order p is e f^(2p). The sum of
         errors is least for a number of cells where 2p e f^(2p+3) (summed over the errors) is the same everywhere; for
         one error that is f = (target / root e)^(1 / (p + 1.5)), the same error in all new cells.
         """
         def counted(target):
-            low, high = (np.full(len(self.tets), bound, dtype=float) for bound in SIZE_CHANGE)
+            low, high = (np.full(len(self.tets), bound, dtype=float) for bound in (SIZE_CHANGE[0], largest))
             for _ in range(40):
                 middle = (low + high) / 2
                 small = sum(2 * p * e * middle ** (2 * p + 3) for e, p in self.errors) < target

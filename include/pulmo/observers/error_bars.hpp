@@ -39,6 +39,13 @@ struct MoreBreaths {
   std::optional<double> periodic; ///< until breaths are periodic; empty where one breath does not tell that
 };
 
+/// Why a sweep has no part of a number's error.
+enum class Unresolved { phase_ended_early, few_steps_in_a_phase, steps_too_long, cells_too_large };
+
+/// The key of a reason in summary.json (docs/accuracy/error_bars.md), and the words for one who reads the table.
+const char *key_of(Unresolved reason);
+const char *words_of(Unresolved reason);
+
 /// A clinical number with what the discretisation makes it wrong by, each part in the number's unit. A part that could
 /// not be had is empty.
 struct ErrorBar {
@@ -49,7 +56,10 @@ struct ErrorBar {
   std::optional<double> corrected;   ///< the value with what it lacks, where its sign is known
   std::optional<double> corrected_error;
   std::optional<MoreBreaths> more_breaths; ///< by a sweep
-  std::string unresolved;                  ///< why a part is empty, for one who reads the table
+  std::vector<Unresolved> unresolved;      ///< why parts are empty
+
+  /// The words of all reasons; empty if there are none.
+  std::string unresolved_words() const;
 
   /// The sum of the parts (they may all point the same way); empty if one is missing.
   std::optional<double> total() const;
@@ -64,9 +74,9 @@ double space_share(const ClinicalEntry &entry, const LackingParts &parts);
 /// space_share() of all numbers of the sweep (1 at most), by which an estimate of first order may be off; a third of
 /// the bar is that of the corrected value. A part of more than a tenth of the number is no small change, and empty;
 /// that in space is empty, too, where @p largest_share is above 3.
-/// @p trouble_in_time: why there is no part in time; empty: there is one.
+/// @p trouble_in_time: why there is no part in time, if there is none.
 ErrorBar lacking_bar(const ClinicalEntry &entry, const LackingParts &parts, double largest_share,
-                     const std::string &trouble_in_time);
+                     std::optional<Unresolved> trouble_in_time);
 
 /// One run that the estimate was made from.
 struct ErrorLevel {
