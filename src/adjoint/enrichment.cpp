@@ -339,7 +339,7 @@ PetscErrorCode Enrichment::solve()
 }
 
 PetscErrorCode Enrichment::add(const Sweep::Solved &stage, const std::vector<Later> &later,
-                               const std::vector<Past> &past, Mat matrix, PetscReal share, ByCell &sums, ByCell *left)
+                               const std::vector<Past> &past, Mat matrix, ByCell &sums, ByCell *left)
 {
   const StageRecord &record = stage.record;
   const bool held = record.airway.mode != Airway::Mode::free && field_ == pressure;
@@ -393,7 +393,7 @@ PetscErrorCode Enrichment::add(const Sweep::Solved &stage, const std::vector<Lat
   const auto take = [&](PetscReal factor) {
     for (std::size_t k = 0; k < both.size(); ++k)
       for (std::size_t c = 0; c < parts[k].size(); ++c)
-        (k < count ? sums[k] : (*left)[k - count])[c] += (k < count ? share : 1) * factor * parts[k][c];
+        (k < count ? sums[k] : (*left)[k - count])[c] += factor * parts[k][c];
   };
   PetscCall(rich_.weighted_residual(false, record.time, x_, rate_, both, parts));
   take(1);

@@ -10,18 +10,24 @@ namespace pulmo {
 
 namespace {
 
-/// The displacement is looked at in one of so many stages, and in so many at least.
-constexpr std::size_t stages_a_sample = 12, least_samples = 5;
+/// A look at the displacement stands for so many stages at most, and for none whose size (sizes()) is so many times
+/// larger or smaller, where that is more than the second share of the largest of its number.
+constexpr PetscInt stages_a_sample = 12;
+constexpr PetscReal alike = 2, counts = 0.05;
 
 /// Of a number that looks at no more stages than these, each is looked at.
 constexpr std::size_t few_stages = 3;
 
 using ByCell = std::vector<std::vector<PetscReal>>;
 
+void add_to(PetscReal factor, const std::vector<PetscReal> &part, std::vector<PetscReal> &sum)
+{
+  for (std::size_t c = 0; c < part.size(); ++c) sum[c] += factor * part[c];
+}
+
 void add(PetscReal factor, const ByCell &parts, ByCell &sums)
 {
-  for (std::size_t k = 0; k < parts.size(); ++k)
-    for (std::size_t c = 0; c < parts[k].size(); ++c) sums[k][c] += factor * parts[k][c];
+  for (std::size_t k = 0; k < parts.size(); ++k) add_to(factor, parts[k], sums[k]);
 }
 
 /// Weights of values at times @p t in the derivative at t[at] of the polynomial through them.
@@ -66,40 +72,31 @@ std::vector<double> ErrorParts::kinks() const
   return times;
 }
 
-void ErrorParts::choose_samples(const std::vector<Functional> &functionals)
+void ErrorParts::find_looked_at(const std::vector<Functional> &functionals)
 {
   const auto &stages = trajectory_.stages();
-  const auto count = static_cast<PetscInt>(stages.size());
-  std::vector<bool> alone(stages.size(), false);
-  PetscInt last = 0; // that matters
+  looked_at_.assign(stages.size(), false);
   for (const Functional &f : functionals) {
-    std::vector<PetscInt> wanted;
-    for (PetscInt n = 1; n < count; ++n) {
-      const PetscInt row = stages[static_cast<std::size_t>(n)].row;
-      if (row < 0) continue;
-      const auto i = static_cast<std::size_t>(row);
+    std::vector<std::size_t> wanted;
+    for (std::size_t n = 1; n < stages.size(); ++n) {
+      if (stages[n].row < 0) continue;
+      const auto i = static_cast<std::size_t>(stages[n].row);
       if (f.by_volume[i] != 0 || f.by_pressure[i] != 0 || f.by_flow[i] != 0) wanted.push_back(n);
     }
-    if (!wanted.empty()) last = std::max(last, wanted.back());
-    if (wanted.size() <= few_stages)
-      for (const PetscInt n : wanted) alone[static_cast<std::size_t>(n)] = true;
+    if (wanted.size() > few_stages) continue;
+    for (const std::size_t n : wanted) looked_at_[n] = true;
   }
-  std::vector<PetscInt> others;
-  sample_of_.assign(stages.size(), -1);
-  for (PetscInt n = 1; n <= last; ++n) {
-    if (alone[static_cast<std::size_t>(n)])
-      sample_of_[static_cast<std::size_t>(n)] = n;
-    else
-      others.push_back(n);
+}
+
+bool ErrorParts::samples(PetscInt stage, const std::vector<PetscReal> &size)
+{
+  bool differs = sample_.size.empty() || ++sample_.age >= stages_a_sample;
+  for (std::size_t k = 0; k < size.size(); ++k) {
+    largest_[k] = std::max(largest_[k], size[k]);
+    if (differs || size[k] < counts * largest_[k]) continue;
+    differs = size[k] > alike * sample_.size[k] || sample_.size[k] > alike * size[k];
   }
-  // without gas each stage stands for itself
-  const std::size_t size = others.size(),
-                    samples = gas_ ? std::min(size, std::max(least_samples, size / stages_a_sample)) : size;
-  for (std::size_t s = 0; s < samples; ++s) {
-    const std::size_t begin = size * s / samples, end = size * (s + 1) / samples;
-    for (std::size_t i = begin; i < end; ++i)
-      sample_of_[static_cast<std::size_t>(others[i])] = others[(begin + end) / 2];
-  }
+  return !gas_ || differs || looked_at_[static_cast<std::size_t>(stage)];
 }
 
 PetscErrorCode ErrorParts::setup(const std::vector<Functional> &functionals)
@@ -113,12 +110,13 @@ PetscErrorCode ErrorParts::setup(const std::vector<Functional> &functionals)
   gas_ = fields > pressure;
   lacking_.assign(count, {});
   rough_.assign(count, 0);
-  for (ByCell *part : {&solver_, &time_, &flow_part_, &tissue_part_, &group_.part})
+  for (ByCell *part : {&solver_, &time_, &flow_part_, &tissue_part_, &in_space_})
     part->assign(count, std::vector<PetscReal>(cells, 0));
   PetscCall(DMCreateLocalVector(model_.dm(), state_.out()));
   if (gas_) PetscCall(flow_.emplace(pressure).setup(model_));
   PetscCall(tissue_.emplace(displacement).setup(model_));
-  choose_samples(functionals);
+  find_looked_at(functionals);
+  largest_.assign(count, 0);
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -250,18 +248,6 @@ PetscErrorCode ErrorParts::sizes(const Sweep::Solved &stage, std::vector<PetscRe
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-void ErrorParts::end_group()
-{
-  for (std::size_t k = 0; group_.sample >= 0 && k < group_.part.size(); ++k) {
-    const PetscReal stands_for = group_.sampled[k] > 0 ? group_.all[k] / group_.sampled[k] : 0;
-    for (std::size_t c = 0; c < group_.part[k].size(); ++c) {
-      tissue_part_[k][c] += stands_for * group_.part[k][c];
-      group_.part[k][c] = 0;
-    }
-  }
-  group_.sample = -1;
-}
-
 PetscErrorCode ErrorParts::add_space(const Sweep::Solved &stage)
 {
   const StageRecord &record = stage.record;
@@ -276,9 +262,9 @@ PetscErrorCode ErrorParts::add_space(const Sweep::Solved &stage)
     PetscCall(trajectory_.state(record.past[i], states[i]));
     past.push_back({record.weight[i] * model_.row_scale(pressure), states[i]});
   }
-  if (flow_) PetscCall(flow_->add(stage, later, past, simulation_.matrix(), 1, flow_part_, &solver_));
+  if (flow_) PetscCall(flow_->add(stage, later, past, simulation_.matrix(), flow_part_, &solver_));
   for (int i = 0; gas_ && i < 2; ++i) {
-    if (record.past[i] < 0 || sample_of_[static_cast<std::size_t>(record.past[i])] != record.past[i]) continue;
+    if (record.past[i] < 0) continue;
     Kept kept{record.weight[i] * model_.row_scale(pressure), {}};
     for (const Vec z : stage.adjoint) {
       VecHandle copy;
@@ -288,22 +274,17 @@ PetscErrorCode ErrorParts::add_space(const Sweep::Solved &stage)
     }
     later_[record.past[i]].push_back(std::move(kept));
   }
-  const PetscInt sample = sample_of_[static_cast<std::size_t>(stage.number)];
   std::vector<PetscReal> size;
   PetscCall(sizes(stage, size));
-  if (sample != group_.sample) {
-    end_group();
-    group_.sample = sample;
-    group_.all.assign(size.size(), 0);
-    group_.sampled = group_.all;
+  if (samples(stage.number, size)) {
+    for (const Kept &kept : later_[stage.number])
+      later.push_back({kept.factor, {kept.adjoint.begin(), kept.adjoint.end()}});
+    sample_ = {0, size, ByCell(size.size(), std::vector<PetscReal>(in_space_.front().size(), 0))};
+    PetscCall(tissue_->add(stage, later, past, simulation_.matrix(), sample_.part));
   }
-  for (std::size_t k = 0; k < size.size(); ++k) group_.all[k] += size[k];
-  if (sample != stage.number) PetscFunctionReturn(PETSC_SUCCESS);
-  group_.sampled = size;
-  for (const Kept &kept : later_[stage.number])
-    later.push_back({kept.factor, {kept.adjoint.begin(), kept.adjoint.end()}});
-  PetscCall(tissue_->add(stage, later, past, simulation_.matrix(), 1, group_.part, nullptr));
-  later_.erase(stage.number);
+  later_.erase(later_.lower_bound(stage.number), later_.end());
+  for (std::size_t k = 0; k < size.size(); ++k)
+    if (sample_.size[k] > 0) add_to(size[k] / sample_.size[k], sample_.part[k], tissue_part_[k]);
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -343,7 +324,6 @@ PetscErrorCode ErrorParts::run(Sweep &sweep, const std::vector<Functional> &func
   PetscCall(setup(functionals));
   PetscCall(sweep.run(
       functionals, tolerance, [&](const Sweep::Solved &stage) { return visit(sweep, stage); }, failure));
-  end_group();
   PetscCall(total(solver_, sums));
   for (std::size_t k = 0; k < sums.size(); ++k) lacking_[k].solver += sums[k];
   PetscCall(total(time_, sums));

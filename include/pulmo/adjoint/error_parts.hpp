@@ -16,8 +16,8 @@ namespace pulmo {
 ///         that the number itself is a sum over the rows, and its largest values lie between them
 ///         (Functional::better_value);
 /// space   elements one degree richer (Enrichment): for the pressure in every stage; for the displacement, without
-///         airflow in every stage, else in one of twelve, which stands for those around it by the size of multipliers
-///         and displacements there, and where a number looks at a single stage in that.
+///         airflow in every stage, else in some: a look stands for the stages before it by the size of multipliers
+///         and displacements there, until that has changed much.
 class ErrorParts {
 public:
   ErrorParts(const Scene &scene, Model &model, Simulation &simulation, const Trajectory &trajectory)
@@ -45,16 +45,17 @@ private:
   };
 
   PetscErrorCode setup(const std::vector<Functional> &functionals);
-  /// Chooses the stages where the displacement is looked at.
-  void choose_samples(const std::vector<Functional> &functionals);
+  /// Notes the stages that a number looks at itself, if these are few.
+  void find_looked_at(const std::vector<Functional> &functionals);
+  /// Whether to look at the displacement in a stage where the numbers have these sizes(): the last look is of another
+  /// kind, or long ago.
+  bool samples(PetscInt stage, const std::vector<PetscReal> &size);
   PetscErrorCode visit(const Sweep &sweep, const Sweep::Solved &stage);
   PetscErrorCode add_solver(const Sweep::Solved &stage);
   PetscErrorCode add_time(const Sweep &sweep, const Sweep::Solved &stage);
   PetscErrorCode add_space(const Sweep::Solved &stage);
   /// [number]: sum of |z u| over the displacements.
   PetscErrorCode sizes(const Sweep::Solved &stage, std::vector<PetscReal> &sums) const;
-  /// Adds what the sample of the group at hand found, for all stages of the group.
-  void end_group();
   /// Stages, and by how much their weight in a better rate of a stage exceeds that in its own, 1/s.
   using Changes = std::vector<std::pair<PetscInt, PetscReal>>;
   /// @p rough: there are too few between two kinks.
@@ -68,14 +69,15 @@ private:
   const Trajectory &trajectory_;
   bool gas_ = false;
   std::optional<Enrichment> flow_, tissue_;
-  std::vector<PetscInt> sample_of_;             ///< [stage]: where the displacement is looked at for it, too
+  std::vector<bool> looked_at_;                 ///< [stage]
   std::map<PetscInt, std::vector<Kept>> later_; ///< [stage]
   struct {
-    PetscInt sample = -1;
-    std::vector<PetscReal> all, sampled; ///< [number]: sizes
+    PetscInt age = 0; ///< stages ago
+    std::vector<PetscReal> size;
     ByCell part;
-  } group_;                      ///< stages with one sample
-  std::vector<PetscReal> rough_; ///< [number]
+  } sample_;                       ///< the last look at the displacement
+  std::vector<PetscReal> largest_; ///< [number]: size so far
+  std::vector<PetscReal> rough_;   ///< [number]
   std::vector<LackingParts> lacking_;
   ByCell solver_, time_, flow_part_, tissue_part_, in_space_;
   VecHandle state_; ///< local
