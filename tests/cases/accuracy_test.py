@@ -396,6 +396,15 @@ class Tool(unittest.TestCase):
         again = tool(*call)
         self.assertEqual(again.stdout[again.stdout.index("wrote "):].split(";")[0], last.split(";")[0])
 
+    def test_breaths_that_are_not_periodic(self):
+        """Gas that is trapped: the answer says that further breaths change the number, which no bar counts."""
+        call = ["pcv", "--build", os.path.dirname(pulmo.PROGRAM), "--output", pulmo.scratch(), "--method", "sweep", "--solvers", "direct", "--question",
+                "V_T=30%", "--meshes", pulmo.mesh("cube.msh"), "--", *SCENE, "-airflow_permeability", "100", "-ventilator_expiration"]
+        for expiration, told in (("0.2", True), ("4", False)):
+            run = tool(*call, expiration)
+            self.assertEqual(run.returncode, 0, run.stdout + run.stderr)
+            self.assertEqual("V_T changes by" in run.stdout and "give the scene more breaths" in run.stdout, told, run.stdout)
+
     def test_no_answer_by_sweeps(self):
         air = pathlib.Path(pulmo.scratch() + ".opts")
         air.write_text("-airflow\n-airflow_surfaces x1\n-chest_wall\n-chest_wall_surfaces x0,y0,y1,z0,z1\n-mesh_scale 100\n")

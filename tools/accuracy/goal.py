@@ -25,6 +25,7 @@ MARGIN = 0.8                    # a prediction aims at so much of what is allowe
 TELLING = 0.76                  # sizes of cells that tell of their facets: of two nearer ones the difference is doubtful
 STAKE = 0.6                     # of what the budget leaves, for a run that does not promise the answer
 MOST_RUNS = 12
+UNSTEADY = 0.25                 # of what is asked: more that further breaths change is told
 # numbers that a sweep knows, and of its bars (pulmo/observers/error_bars.hpp): what richer elements see of the error in space, the bar of a
 # corrected value over its parts, the largest share that is resolved
 SWEPT = {**SHORT, "plateau_pressure_cmH2O": "P_plat", "peak_expiratory_flow_ml_per_s": "Q_exp", "work_j": "work"}
@@ -289,7 +290,20 @@ class Goal:
         for key, share in self.asked.items():
             texts.append(f"{'' if self.met() else 'NOT within ' + percent(share) + ': '}{self.value(key)}; {self.last.run[self.options.clock]:.3g} s "
                          f"with its sweep, {self.spent:.3g} s in all ({self.options.clock})")
-        return texts + self.cost_of_a_tenth()
+        return texts + self.unsteady() + self.cost_of_a_tenth()
+
+    def unsteady(self):
+        """What the bars do not count: breaths that are not periodic yet."""
+        texts = []
+        for key, share in self.asked.items():
+            more = self.last.parts[key].get("more_breaths")
+            if not more:
+                continue
+            change = more["next"] if more["periodic"] is None else more["periodic"]
+            if abs(change) > UNSTEADY * share * abs(self.last.corrected(key)):
+                until = "with one more breath" if more["periodic"] is None else "until breaths are periodic"
+                texts.append(f"{short(key)} changes by {change:+.2g} {until}, which is in no bar: give the scene more breaths")
+        return texts
 
     def cost_of_a_tenth(self):
         """What the tenth of each share would take."""
