@@ -1,9 +1,6 @@
 #include "pulmo/program/error_estimate.hpp"
 
 #include "pulmo/adjoint/error_parts.hpp"
-#include "pulmo/adjoint/periodicity.hpp"
-#include "pulmo/adjoint/recording.hpp"
-
 #include "pulmo/base/units.hpp"
 #include "pulmo/mesh/read_mesh.hpp"
 #include "pulmo/observers/output.hpp"
@@ -29,9 +26,6 @@ constexpr double same_lung = 0.1;
 /// land on the ends of phases.
 constexpr double least_coarsening = 1.2;
 
-/// Where more than this share of a number is a guess of a sweep's part in time, that part is not resolved.
-constexpr double guessed = 1e-3;
-
 /// Solver tolerances are tightened by this factor, but not to rounding.
 constexpr PetscReal tighter = 0.01, tightest = 1e-12;
 
@@ -55,31 +49,11 @@ double cell_size_ratio(const ErrorLevel &level, const ErrorLevel &other)
   return std::cbrt(other.volume / static_cast<double>(other.cells) / (level.volume / static_cast<double>(level.cells)));
 }
 
-/// Whether a condition may have ended a phase of the run before its time: it does so with a step, up to one late, and
-/// no part in time sees that.
-bool ended_early(const Scene &scene, const std::vector<SignalRow> &rows)
-{
-  const Programme &programme = *scene.facts().ventilator;
-  return programme.may_end_early() && rows.back().time < programme.phases().back().end - rows.back().dt / 1000;
-}
-
 /// The values of number @p i on both levels, if both have it.
 std::optional<std::pair<double, double>> both(const ErrorLevel &a, const ErrorLevel &b, std::size_t i)
 {
   if (i >= a.numbers.size() || i >= b.numbers.size() || !a.numbers[i].value || !b.numbers[i].value) return {};
   return {{*a.numbers[i].value, *b.numbers[i].value}};
-}
-
-/// Fills in what @p simulation is, but not its name, seconds and numbers.
-PetscErrorCode describe_level(const Simulation &simulation, const Scene &scene, ErrorLevel &level)
-{
-  PetscFunctionBeginUser;
-  level.dt = simulation.wanted_dt();
-  level.cells = scene.mesh().cells();
-  level.volume = scene.mesh().volume() / units::mm3_per_ml;
-  level.steps = static_cast<PetscInt>(simulation.rows().size()) - 1;
-  PetscCall(VecGetSize(simulation.state(), &level.dofs));
-  PetscFunctionReturn(PETSC_SUCCESS);
 }
 
 /// Ends the estimate unless @p other is another mesh of the same lung.
@@ -162,6 +136,23 @@ ErrorBar error_bar(const std::vector<ErrorLevel> &levels, std::size_t i, int ord
 }
 
 } // namespace
+
+bool ErrorEstimate::ended_early(const Scene &scene, const std::vector<SignalRow> &rows)
+{
+  const Programme &programme = *scene.facts().ventilator;
+  return programme.may_end_early() && rows.back().time < programme.phases().back().end - rows.back().dt / 1000;
+}
+
+PetscErrorCode ErrorEstimate::describe(const Simulation &simulation, const Scene &scene, ErrorLevel &level)
+{
+  PetscFunctionBeginUser;
+  level.dt = simulation.wanted_dt();
+  level.cells = scene.mesh().cells();
+  level.volume = scene.mesh().volume() / units::mm3_per_ml;
+  level.steps = static_cast<PetscInt>(simulation.rows().size()) - 1;
+  PetscCall(VecGetSize(simulation.state(), &level.dofs));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
 
 PetscErrorCode ErrorEstimate::declare(Options &options)
 {
@@ -323,7 +314,7 @@ PetscErrorCode ErrorEstimate::run_level(const Options &options, const Output &ou
                     "stopped by %s while the errors were estimated; the run itself is whole in %s, without error bars",
                     signal.name(), output.directory().c_str());
   PetscCall(PetscTime(&end));
-  PetscCall(describe_level(simulation, run.scene(), level));
+  PetscCall(describe(simulation, run.scene(), level));
   level.seconds = end - begin;
   if (finished)
     level.numbers = regions.numbers(simulation.rows());
@@ -343,7 +334,7 @@ PetscErrorCode ErrorEstimate::make(const Options &options, const Output &output,
 
   PetscFunctionBeginUser;
   levels.assign(n_levels, {});
-  PetscCall(describe_level(simulation, scene, levels[fine]));
+  PetscCall(describe(simulation, scene, levels[fine]));
   levels[fine].name = "the run itself";
   levels[fine].seconds = simulation.seconds().total;
   levels[fine].numbers = numbers;
@@ -373,89 +364,6 @@ PetscErrorCode ErrorEstimate::make(const Options &options, const Output &output,
                             "run with a smaller -ts_dt tells";
   for (std::size_t i = 0; i < numbers.size(); ++i)
     if (numbers[i].value) report.bars.push_back(error_bar(levels, i, longer ? simulation.scheme().order() : 0));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-PetscErrorCode ErrorEstimate::make_by_sweep(const Options &options, const Scene &scene, Model &model,
-                                            Simulation &simulation, const Recording &recording,
-                                            const RegionAudit &regions, FieldWriter &fields, ErrorReport &report) const
-{
-  const MPI_Comm comm = options.comm();
-  Sweep sweep(scene, model, simulation, recording.trajectory());
-  ErrorParts parts(scene, model, simulation, recording.trajectory());
-  const std::vector<SignalRow> rows = regions.complete(simulation.rows());
-  const std::vector<ClinicalEntry> numbers = regions.numbers(simulation.rows());
-  Periodicity periodicity(scene, rows, recording.trajectory());
-  std::vector<Functional> functionals;
-  std::vector<std::pair<std::string, std::vector<PetscReal>>> in_space;
-  PetscLogDouble begin, end;
-
-  PetscFunctionBeginUser;
-  PetscCall(PetscTime(&begin));
-  report.method = "sweep";
-  report.levels.resize(1);
-  PetscCall(describe_level(simulation, scene, report.levels.front()));
-  report.levels.front().name = "the run itself";
-  report.levels.front().seconds = simulation.seconds().total;
-  report.levels.front().numbers = numbers;
-  PetscCall(recording.complaint(comm, report.failure));
-  if (!report.failure.empty()) PetscFunctionReturn(PETSC_SUCCESS);
-  for (const std::string &name : names_.empty() ? functional_names() : names_) {
-    const auto f = functional(name, rows, parts.kinks(), &regions);
-    if (f)
-      functionals.push_back(*f);
-    else if (!names_.empty())
-      PetscCall(PetscPrintf(comm, "pulmo: note: -error_estimate_numbers: this run has no %s\n", name.c_str()));
-  }
-  const std::size_t asked = functionals.size();
-  // R tells best of cells that are too large, for the other numbers too
-  const auto witness = functional("R", rows, parts.kinks());
-  if (asked > 0 && witness && std::find(names_.begin(), names_.end(), "R") == names_.end() && !names_.empty())
-    functionals.push_back(*witness);
-  if (functionals.empty()) {
-    report.failure = "the run has none of the numbers";
-    PetscFunctionReturn(PETSC_SUCCESS);
-  }
-  StopSignal signal(comm);
-  sweep.heed(signal);
-  periodicity.ask(sweep);
-  PetscCall(PetscPrintf(comm, "\nError estimate: a sweep back over %d steps\n",
-                        static_cast<int>(simulation.rows().size()) - 1));
-  PetscCall(parts.run(sweep, functionals, recording.tolerance(), report.failure));
-  PulmoFailureCheck(!sweep.stopped(), comm,
-                    "stopped by %s while the errors were estimated; the run itself is whole, without error bars",
-                    signal.name());
-  if (!report.failure.empty()) PetscFunctionReturn(PETSC_SUCCESS); // its parts are of some steps only
-  std::vector<ClinicalEntry> entries;
-  double largest_share = 0;
-  for (std::size_t k = 0; k < functionals.size(); ++k) {
-    const Functional &f = functionals[k];
-    const auto entry =
-        std::find_if(numbers.begin(), numbers.end(), [&](const ClinicalEntry &e) { return f.key == e.key; });
-    if (f.part) {
-      entries.push_back({f.key, "ventilation of " + f.part->region, f.unit, f.value});
-    } else {
-      PetscCheck(entry != numbers.end() && entry->value, PETSC_COMM_SELF, PETSC_ERR_PLIB, "no clinical number %s",
-                 f.key.c_str());
-      entries.push_back(*entry);
-    }
-    largest_share = std::max(largest_share, space_share(entries.back(), parts.lacking()[k]));
-    if (k < asked) in_space.emplace_back("lacks_in_space_" + f.key, parts.in_space()[k]);
-  }
-  const bool early = ended_early(scene, simulation.rows());
-  for (std::size_t k = 0; k < asked; ++k) {
-    const bool resolved = functionals[k].resolved && parts.rough_in_time(k) <= guessed * std::abs(*entries[k].value);
-    std::optional<Unresolved> trouble;
-    if (early)
-      trouble = Unresolved::phase_ended_early;
-    else if (!resolved)
-      trouble = Unresolved::few_steps_in_a_phase;
-    report.bars.push_back(lacking_bar(entries[k], parts.lacking()[k], largest_share, trouble));
-    report.bars.back().more_breaths = periodicity.change(functionals[k], k);
-  }
-  PetscCall(fields.write_cells("errors", in_space));
-  PetscCall(PetscTime(&end));
-  report.sweep_seconds = end - begin;
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -44,6 +44,11 @@ public:
                                ErrorReport &report) const;
 
 private:
+  /// Whether a condition may have ended a phase of the run before its time: it does so with a step, up to one late, and
+  /// no part in time sees that.
+  static bool ended_early(const Scene &scene, const std::vector<SignalRow> &rows);
+  /// Fills in what @p simulation is, but not its name, seconds and numbers.
+  static PetscErrorCode describe(const Simulation &simulation, const Scene &scene, ErrorLevel &level);
   PetscErrorCode choose_method(const Options &options, const Scene &scene, const Model &model, bool restarts);
   PetscErrorCode try_other_mesh(const Options &options, const Scene &scene) const;
   PetscErrorCode other_mesh(OptionList &changes, std::string &name) const;
