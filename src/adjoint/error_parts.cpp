@@ -11,9 +11,10 @@ namespace pulmo {
 namespace {
 
 /// A look at the displacement stands for so many stages at most, and for none whose size (sizes()) is so many times
-/// larger or smaller, where that is more than the second share of the largest of its number.
+/// larger or smaller, where that is more than the second share of the largest of its number, and what was found of the
+/// tissue more than the third of the flow's part.
 constexpr PetscInt stages_a_sample = 12;
-constexpr PetscReal alike = 2, counts = 0.05;
+constexpr PetscReal alike = 3, counts = 0.2, matters = 0.1;
 
 /// Of a number that looks at no more stages than these, each is looked at.
 constexpr std::size_t few_stages = 3;
@@ -88,12 +89,12 @@ void ErrorParts::find_looked_at(const std::vector<Functional> &functionals)
   }
 }
 
-bool ErrorParts::samples(PetscInt stage, const std::vector<PetscReal> &size)
+bool ErrorParts::samples(PetscInt stage, const std::vector<PetscReal> &size, const Found &found)
 {
   bool differs = sample_.size.empty() || ++sample_.age >= stages_a_sample;
   for (std::size_t k = 0; k < size.size(); ++k) {
     largest_[k] = std::max(largest_[k], size[k]);
-    if (differs || size[k] < counts * largest_[k]) continue;
+    if (differs || size[k] < counts * largest_[k] || found.tissue[k] < matters * found.flow[k]) continue;
     differs = size[k] > alike * sample_.size[k] || sample_.size[k] > alike * size[k];
   }
   return !gas_ || differs || looked_at_[static_cast<std::size_t>(stage)];
@@ -225,6 +226,16 @@ PetscErrorCode ErrorParts::add_other_rates(const Sweep::Solved &stage, const Cha
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode ErrorParts::found(Found &sizes) const
+{
+  PetscFunctionBeginUser;
+  PetscCall(total(flow_part_, sizes.flow));
+  PetscCall(total(tissue_part_, sizes.tissue));
+  for (std::vector<PetscReal> *sums : {&sizes.flow, &sizes.tissue})
+    for (PetscReal &sum : *sums) sum = std::abs(sum);
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode ErrorParts::sizes(const Sweep::Solved &stage, std::vector<PetscReal> &sums) const
 {
   const CellLayout &layout = model_.assembly().layout();
@@ -275,8 +286,10 @@ PetscErrorCode ErrorParts::add_space(const Sweep::Solved &stage)
     later_[record.past[i]].push_back(std::move(kept));
   }
   std::vector<PetscReal> size;
+  Found so_far;
   PetscCall(sizes(stage, size));
-  if (samples(stage.number, size)) {
+  PetscCall(found(so_far));
+  if (samples(stage.number, size, so_far)) {
     for (const Kept &kept : later_[stage.number])
       later.push_back({kept.factor, {kept.adjoint.begin(), kept.adjoint.end()}});
     sample_ = {0, size, ByCell(size.size(), std::vector<PetscReal>(in_space_.front().size(), 0))};

@@ -14,7 +14,7 @@ namespace {
 /// Marks a file of pulmo, and tells how to read it. Raise it when a name or a meaning changes.
 constexpr const char *marker = "pulmo_checkpoint";
 // 2: the names of the mesh, the step sizes of phases; 3: what the solver left of its equations
-constexpr int format = 3;
+constexpr int format = 4;
 
 /// @p data is resized to what is there; @p type as in memory.
 template <class T>

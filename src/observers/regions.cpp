@@ -162,6 +162,7 @@ PetscErrorCode RegionAudit::persist(Archive &archive, Vec)
   const std::vector<RegionState> empty(volumes_.size(), nothing);
 
   PetscFunctionBeginUser;
+  PetscCall(archive.value("regions_breath_end_s", breath_end_)); // a run that goes on may accept no further step
   PetscCall(archive.table("regions", rows_, empty, [](std::vector<RegionState> &row, TableCells &cells) {
     for (RegionState &s : row) {
       cells(s.volume_change, s.mean_J, s.sd_J, s.mean_pressure, s.sd_pressure);

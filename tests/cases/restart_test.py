@@ -783,6 +783,20 @@ class Faults(RestartCase):
         self.expect_same(pulmo.finished(options), other, SAME_RANKS)
 
 
+    def test_failed_again_at_once(self):
+        """A run that fails within its first breath, and once more with the first step after the restart: that breath is not whole."""
+        scene = pulmo.BLOCK + pulmo.DIRECT + pulmo.QUIET + [
+            "-tissue", "patte", "-airflow", "-airflow_permeability", "100", "-airflow_surfaces", "x1", "-chest_wall", "-chest_wall_surfaces",
+            "x0,y0,y1,z0,z1", "-ventilator", "pcv", "-ventilator_pip", "400", "-ventilator_ramp", "0.3", "-ts_dt", "0.1", "-energy_audit", "off"]
+        first = pulmo.Case(scene)
+        again = pulmo.Case(scene + ["-restart", first.path("checkpoint.h5")])
+        one, two = (case.json("failure.json") for case in (first, again))
+        self.assertEqual(two["end_time_s"], one["end_time_s"], "no step was accepted")
+        for key in ("why_no_numbers", "breaths", "tidal_volume_ml", "numbers_of_breath"):
+            self.assertEqual(two.get(key), one.get(key), key)
+        self.assertIn("within its first breath", one["why_no_numbers"])
+
+
 class BadFiles(RestartCase):
     @classmethod
     def setUpClass(cls):

@@ -44,12 +44,17 @@ private:
     std::vector<VecHandle> adjoint;
   };
 
+  struct Found { ///< [number]: size of the parts in space so far
+    std::vector<PetscReal> flow, tissue;
+  };
+
   PetscErrorCode setup(const std::vector<Functional> &functionals);
   /// Notes the stages that a number looks at itself, if these are few.
   void find_looked_at(const std::vector<Functional> &functionals);
   /// Whether to look at the displacement in a stage where the numbers have these sizes(): the last look is of another
   /// kind, or long ago.
-  bool samples(PetscInt stage, const std::vector<PetscReal> &size);
+  bool samples(PetscInt stage, const std::vector<PetscReal> &size, const Found &found);
+  PetscErrorCode found(Found &sizes) const;
   PetscErrorCode visit(const Sweep &sweep, const Sweep::Solved &stage);
   PetscErrorCode add_solver(const Sweep::Solved &stage);
   PetscErrorCode add_time(const Sweep &sweep, const Sweep::Solved &stage);
