@@ -4,6 +4,39 @@
 
 namespace pulmo {
 
+namespace {
+
+constexpr PetscInt max_size = 128;
+
+/// Columns of an element matrix whose entries go to one part of the matrix. Most are the three components of a node,
+/// which are neighbours there as here.
+struct Columns {
+  struct Column {
+    PetscInt first, point, free_index; ///< the first column, the mesh point of the cell, its place among the point's
+  };
+  Column threes[max_size / 3], ones[max_size];
+  PetscInt n_threes = 0, n_ones = 0;
+  PetscInt place_of_threes[max_size / 3], place_of_ones[max_size];
+
+  /// @p offset: where the mesh points' columns begin in the rows at hand.
+  void place(const std::int32_t *offset)
+  {
+    for (PetscInt k = 0; k < n_threes; ++k) place_of_threes[k] = offset[threes[k].point] + threes[k].free_index;
+    for (PetscInt k = 0; k < n_ones; ++k) place_of_ones[k] = offset[ones[k].point] + ones[k].free_index;
+  }
+  void add(const PetscScalar *entries, PetscScalar scale, PetscScalar *row) const
+  {
+    for (PetscInt k = 0; k < n_threes; ++k) {
+      const PetscScalar *from = entries + threes[k].first;
+      PetscScalar *to = row + place_of_threes[k];
+      for (int d = 0; d < 3; ++d) to[d] += scale * from[d];
+    }
+    for (PetscInt k = 0; k < n_ones; ++k) row[place_of_ones[k]] += scale * entries[ones[k].first];
+  }
+};
+
+} // namespace
+
 PetscErrorCode MatrixMap::setup(DM dm, const CellLayout &layout, Mat A)
 {
   PetscObjectId id;
@@ -168,7 +201,6 @@ PetscErrorCode MatrixMap::begin()
 
 PetscErrorCode MatrixMap::add(PetscInt cell, const PetscScalar *matrix, const PetscReal row_scale[], Mat A)
 {
-  constexpr PetscInt max_size = 128;
   const PetscInt size = layout_->size;
   const PetscInt *dofs = layout_->cell_dofs(cell), *points = layout_->cell_points(cell);
 
@@ -185,38 +217,28 @@ PetscErrorCode MatrixMap::add(PetscInt cell, const PetscScalar *matrix, const Pe
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
-  // free columns, first those of this rank, then the others
-  PetscInt columns[max_size], n_columns[2] = {0, 0};
-  for (int part = 0, n = 0; part < 2; ++part) {
-    for (PetscInt j = 0; j < size; ++j)
-      if (free_index_[dofs[j]] >= 0 && (owned_[points[layout_->point_of[j]]] ? 0 : 1) == part) columns[n++] = j;
-    n_columns[part] = n;
+  Columns columns[2]; // of this rank, of the others
+  for (PetscInt j = 0; j < size; ++j) {
+    const auto free = [&](PetscInt k) { return k < size ? free_index_[dofs[k]] : -1; };
+    const PetscInt point = layout_->point_of[j], first = free(j);
+    if (first < 0) continue;
+    Columns &c = columns[owned_[points[point]] ? 0 : 1];
+    const bool three = first + 1 == free(j + 1) && first + 2 == free(j + 2) && layout_->point_of[j + 2] == point;
+    (three ? c.threes[c.n_threes++] : c.ones[c.n_ones++]) = {j, point, first};
+    if (three) j += 2;
   }
-  PetscInt place[max_size], current = -1;
+  PetscInt current = -1;
   for (PetscInt i = 0; i < size; ++i) {
     if (free_index_[dofs[i]] < 0) continue;
     const PetscInt point = layout_->point_of[i];
-    if (point != current) {
-      const std::int32_t *offset = &offset_[(cell * layout_->points + point) * layout_->points];
-      for (PetscInt k = 0; k < n_columns[1]; ++k) {
-        const PetscInt j = columns[k];
-        place[k] = offset[layout_->point_of[j]] + free_index_[dofs[j]];
-      }
-      current = point;
-    }
+    if (point != current)
+      for (Columns &c : columns) c.place(&offset_[(cell * layout_->points + point) * layout_->points]);
+    current = point;
     const PetscScalar *entries = matrix + i * size, scale = row_scale[layout_->field_of[i]];
     const PetscInt row = row_[dofs[i]];
-    if (row < 0) {
-      PetscScalar *target = &ghost_values_[ghost_begin_[-row - 1]];
-      for (PetscInt k = 0; k < n_columns[1]; ++k) target[place[k]] += scale * entries[columns[k]];
-    } else {
-      PetscScalar *target = values_[0] + rows_[0][row];
-      for (PetscInt k = 0; k < n_columns[0]; ++k) target[place[k]] += scale * entries[columns[k]];
-      if (n_columns[1] > n_columns[0]) {
-        target = values_[1] + rows_[1][row];
-        for (PetscInt k = n_columns[0]; k < n_columns[1]; ++k) target[place[k]] += scale * entries[columns[k]];
-      }
-    }
+    for (int part = 0; part < (off_diagonal_ ? 2 : 1); ++part)
+      columns[part].add(entries, scale,
+                        row < 0 ? &ghost_values_[ghost_begin_[-row - 1]] : values_[part] + rows_[part][row]);
   }
   PetscFunctionReturn(PETSC_SUCCESS);
 }

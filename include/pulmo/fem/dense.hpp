@@ -54,13 +54,11 @@ static inline void combine(PetscInt n, const double s[3], const double *G, doubl
     four(out + a) = s0 * four(G + a) + s1 * four(G + n + a) + s2 * four(G + 2 * n + a);
 }
 
-/// K[a][b] += sum_r L[r][a] R[r][b]. Rows of L and R have strides @p lda and @p ldb, rows of K @p ldb.
+/// K[a][b] = sum_r L[r][a] R[r][b]. Rows of L and R have strides @p lda and @p ldb, rows of K @p ldb.
 template <int Rows, int Vectors>
 static inline void product_tile(PetscInt rank, const double *L, PetscInt lda, const double *R, PetscInt ldb, double *K)
 {
-  Vector4 sum[Rows][Vectors];
-  for (int a = 0; a < Rows; ++a)
-    for (int v = 0; v < Vectors; ++v) sum[a][v] = four(K + a * ldb + 4 * v);
+  Vector4 sum[Rows][Vectors] = {};
   for (PetscInt r = 0; r < rank; ++r) {
     for (int a = 0; a < Rows; ++a) {
       const double l = L[r * lda + a];
@@ -78,7 +76,7 @@ static inline void product_rows(PetscInt rows, PetscInt rank, const double *L, P
 {
   PetscInt a = 0;
   for (; a + 5 <= rows; a += 5) product_tile<5, Vectors>(rank, L + a, lda, R, ldb, K + a * ldb);
-  for (; a + 2 <= rows; a += 2) product_tile<2, Vectors>(rank, L + a, lda, R, ldb, K + a * ldb);
+  for (; a + 4 <= rows; a += 4) product_tile<4, Vectors>(rank, L + a, lda, R, ldb, K + a * ldb);
   for (; a < rows; ++a) product_tile<1, Vectors>(rank, L + a, lda, R, ldb, K + a * ldb);
 }
 
@@ -87,7 +85,8 @@ static inline void product(PetscInt rows, PetscInt rank, const double *L, PetscI
 {
   PetscInt b = 0;
   for (; b + 12 <= ldb; b += 12) product_rows<3>(rows, rank, L, lda, R + b, ldb, K + b);
-  for (; b < ldb; b += 4) product_rows<1>(rows, rank, L, lda, R + b, ldb, K + b);
+  if (ldb - b == 8) product_rows<2>(rows, rank, L, lda, R + b, ldb, K + b);
+  if (ldb - b == 4) product_rows<1>(rows, rank, L, lda, R + b, ldb, K + b);
 }
 
 } // namespace pulmo::element

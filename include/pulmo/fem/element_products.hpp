@@ -38,51 +38,61 @@ static inline void add_to_vector(const PointData &data, PetscInt field, const Pe
 /// The element matrix of one pair of fields from g0 ... g3 at all points (null where a pair has none).
 struct MatrixBuilder {
   const PointData &data;
-  PetscScalar *left, *right, *block; ///< [rank][stride of test], [rank][stride of trial], [node][stride of trial]
+  PetscScalar *left, *right, *block; ///< [rank][stride of test], [rank][columns of trial], [node][columns of trial]
 
   static constexpr PetscInt rows_per_point = dim + 1;
 
+  /// Columns of a field in the element matrix, padded to a multiple of 4.
+  static PetscInt columns(const ScalarBasis &basis) { return (basis.nodes * basis.components + 3) / 4 * 4; }
+  static PetscInt most_columns(const TabulatedFields &f)
+  {
+    PetscInt most = 0;
+    for (PetscInt i = 0; i < f.n; ++i) most = std::max({most, columns(f.basis[i]), f.basis[i].stride});
+    return most + 4; // the last node is written with four components
+  }
   static std::size_t scratch_size(const TabulatedFields &f)
   {
-    std::size_t widest = 0;
-    for (PetscInt i = 0; i < f.n; ++i) widest = std::max(widest, Scratch::padded(f.basis[i].stride));
-    return (2 * static_cast<std::size_t>(f.points * rows_per_point) + widest + 8) * widest;
+    const PetscInt most = most_columns(f);
+    return 2 * Scratch::padded(f.points * rows_per_point * most) + Scratch::padded(most * most);
   }
   MatrixBuilder(const PointData &d, Scratch &scratch) : data(d)
   {
-    std::size_t widest = 0;
-    for (PetscInt i = 0; i < d.fields->n; ++i) widest = std::max(widest, Scratch::padded(d.fields->basis[i].stride));
-    left = scratch.take(d.fields->points * rows_per_point * widest);
-    right = scratch.take(d.fields->points * rows_per_point * widest);
-    block = scratch.take(widest * widest);
+    const PetscInt most = most_columns(*d.fields);
+    left = scratch.take(d.fields->points * rows_per_point * most);
+    right = scratch.take(d.fields->points * rows_per_point * most);
+    block = scratch.take(most * most);
   }
 
-  /// The rows of R of one pair of components, R[r] = w (sum_d g_rd G_d + g_r B).
-  void fill_right(PetscInt trial, PetscInt pair, PetscInt pairs, const PetscScalar *g0, const PetscScalar *g1,
-                  const PetscScalar *g2, const PetscScalar *g3) const
+  /// The rows of R of component @p c of the test field, R[r][b * C + e] = w (sum_d g_rd G_d + g_r B) with the
+  /// components e of the trial field side by side, as the element matrix has them.
+  template <int C>
+  void fill_right(const ScalarBasis &trial, const PetscScalar *gradients, PetscInt c, PetscInt Ci,
+                  const PetscScalar *g0, const PetscScalar *g1, const PetscScalar *g2, const PetscScalar *g3) const
   {
-    const ScalarBasis &basis = data.fields->basis[trial];
-    const PetscInt n = basis.stride;
+    const PetscInt n = trial.stride, width = columns(trial);
     PetscScalar *r = right;
     for (PetscInt q = 0; q < data.fields->points; ++q) {
-      const PetscScalar w = data.weights[q], *B = basis.values + q * n, *G = data.gradients[trial] + q * dim * n;
-      const auto row = [&](const PetscScalar *g, const PetscScalar *value) {
-        const PetscScalar v = value ? w * *value : 0;
-        if (g) {
-          const PetscScalar s[3] = {w * g[0], w * g[1], w * g[2]};
-          combine(n, s, G, r);
-          if (value)
-            for (PetscInt b = 0; b < n; b += 4) four(r + b) += v * four(B + b);
-        } else {
-          for (PetscInt b = 0; b < n; b += 4) four(r + b) = v * four(B + b);
-        }
-        r += n;
+      const PetscScalar w = data.weights[q], *B = trial.values + q * n, *G = gradients + q * dim * n;
+      const PetscInt pair = (q * Ci + c) * C;
+      const auto over_components = [&](const PetscScalar *g, PetscInt stride) {
+        return w * Vector4{g[0], C > 1 ? g[stride] : 0, C > 2 ? g[2 * stride] : 0, 0};
       };
-      const PetscInt place = q * pairs + pair;
+      const auto row = [&](const PetscScalar *g, const PetscScalar *value, PetscInt stride) {
+        const Vector4 v = value ? over_components(value, stride) : Vector4{};
+        if (g) {
+          const Vector4 s0 = over_components(g, stride * dim), s1 = over_components(g + 1, stride * dim),
+                        s2 = over_components(g + 2, stride * dim);
+          for (PetscInt b = 0; b < trial.nodes; ++b)
+            four(r + b * C) = s0 * G[b] + s1 * G[n + b] + s2 * G[2 * n + b] + v * B[b];
+        } else {
+          for (PetscInt b = 0; b < trial.nodes; ++b) four(r + b * C) = v * B[b];
+        }
+        r += width;
+      };
       if (g2 || g3)
         for (PetscInt d = 0; d < dim; ++d)
-          row(g3 ? g3 + (place * dim + d) * dim : nullptr, g2 ? g2 + place * dim + d : nullptr);
-      if (g0 || g1) row(g1 ? g1 + place * dim : nullptr, g0 ? g0 + place : nullptr);
+          row(g3 ? g3 + (pair * dim + d) * dim : nullptr, g2 ? g2 + pair * dim + d : nullptr, dim);
+      if (g0 || g1) row(g1 ? g1 + pair * dim : nullptr, g0 ? g0 + pair : nullptr, 1);
     }
   }
 
@@ -90,30 +100,23 @@ struct MatrixBuilder {
            const PetscScalar *g3, PetscScalar *matrix) const
   {
     const ScalarBasis &bi = data.fields->basis[test], &bj = data.fields->basis[trial];
-    const PetscInt Ci = bi.components, Cj = bj.components, ni = bi.stride, nj = bj.stride, Nq = data.fields->points;
+    const PetscInt Ci = bi.components, ni = bi.stride, width = columns(bj), Nq = data.fields->points;
     const bool by_gradient = g2 || g3, by_value = g0 || g1; // of the test function
-    const PetscInt per_point = dim * by_gradient + by_value, rank = Nq * per_point;
+    const PetscInt rank = Nq * (dim * by_gradient + by_value);
 
+    PetscScalar *l = left;
     for (PetscInt q = 0; q < Nq; ++q) {
-      PetscScalar *l = left + q * per_point * ni;
-      if (by_gradient) {
-        const PetscScalar *G = data.gradients[test] + q * dim * ni;
-        for (PetscInt i = 0; i < dim * ni; ++i) l[i] = G[i];
-        l += dim * ni;
-      }
-      if (by_value)
-        for (PetscInt i = 0; i < ni; ++i) l[i] = bi.values[q * ni + i];
+      if (by_gradient) l = std::copy_n(data.gradients[test] + q * dim * ni, dim * ni, l);
+      if (by_value) l = std::copy_n(bi.values + q * ni, ni, l);
     }
     for (PetscInt c = 0; c < Ci; ++c) {
-      for (PetscInt e = 0; e < Cj; ++e) {
-        const PetscInt pair = c * Cj + e;
-        fill_right(trial, pair, Ci * Cj, g0, g1, g2, g3);
-        for (PetscInt i = 0; i < bi.nodes * nj; ++i) block[i] = 0;
-        product(bi.nodes, rank, left, ni, right, nj, block);
-        for (PetscInt a = 0; a < bi.nodes; ++a) {
-          PetscScalar *row = matrix + (bi.offset + a * Ci + c) * data.fields->element_size + bj.offset + e;
-          for (PetscInt b = 0; b < bj.nodes; ++b) row[b * Cj] += block[a * nj + b];
-        }
+      (bj.components == 1   ? fill_right<1>(bj, data.gradients[trial], c, Ci, g0, g1, g2, g3)
+       : bj.components == 2 ? fill_right<2>(bj, data.gradients[trial], c, Ci, g0, g1, g2, g3)
+                            : fill_right<3>(bj, data.gradients[trial], c, Ci, g0, g1, g2, g3));
+      product(bi.nodes, rank, left, ni, right, width, block);
+      for (PetscInt a = 0; a < bi.nodes; ++a) {
+        PetscScalar *row = matrix + (bi.offset + a * Ci + c) * data.fields->element_size + bj.offset;
+        for (PetscInt b = 0; b < bj.nodes * bj.components; ++b) row[b] += block[a * width + b];
       }
     }
   }
