@@ -227,6 +227,16 @@ PetscErrorCode MatrixMap::add(PetscInt cell, const PetscScalar *matrix, const Pe
     (three ? c.threes[c.n_threes++] : c.ones[c.n_ones++]) = {j, point, first};
     if (three) j += 2;
   }
+  // lets the memory begin to bring the rows of the next cell, which would be waited for one after the other
+  if (cell + 1 < layout_->cells) {
+    const PetscInt *next = layout_->cell_dofs(cell + 1), n = layout_->points;
+    for (PetscInt i = 0; i < size; ++i) {
+      if (free_index_[next[i]] < 0 || row_[next[i]] < 0) continue;
+      const PetscScalar *row = values_[0] + rows_[0][row_[next[i]]];
+      const std::int32_t *offset = &offset_[((cell + 1) * n + layout_->point_of[i]) * n];
+      for (PetscInt j = 0; j < n; ++j) __builtin_prefetch(row + offset[j], 1);
+    }
+  }
   PetscInt current = -1;
   for (PetscInt i = 0; i < size; ++i) {
     if (free_index_[dofs[i]] < 0) continue;

@@ -69,7 +69,7 @@ struct MatrixBuilder {
   void fill_right(const ScalarBasis &trial, const PetscScalar *gradients, PetscInt c, PetscInt Ci,
                   const PetscScalar *g0, const PetscScalar *g1, const PetscScalar *g2, const PetscScalar *g3) const
   {
-    const PetscInt n = trial.stride, width = columns(trial);
+    const PetscInt n = trial.stride, nodes = trial.nodes, width = columns(trial);
     PetscScalar *r = right;
     for (PetscInt q = 0; q < data.fields->points; ++q) {
       const PetscScalar w = data.weights[q], *B = trial.values + q * n, *G = gradients + q * dim * n;
@@ -82,10 +82,10 @@ struct MatrixBuilder {
         if (g) {
           const Vector4 s0 = over_components(g, stride * dim), s1 = over_components(g + 1, stride * dim),
                         s2 = over_components(g + 2, stride * dim);
-          for (PetscInt b = 0; b < trial.nodes; ++b)
+          for (PetscInt b = 0; b < nodes; ++b)
             four(r + b * C) = s0 * G[b] + s1 * G[n + b] + s2 * G[2 * n + b] + v * B[b];
         } else {
-          for (PetscInt b = 0; b < trial.nodes; ++b) four(r + b * C) = v * B[b];
+          for (PetscInt b = 0; b < nodes; ++b) four(r + b * C) = v * B[b];
         }
         r += width;
       };
