@@ -219,15 +219,17 @@ PetscErrorCode MatrixMap::add(PetscInt cell, const PetscScalar *matrix, const Pe
 
   Columns columns[2]; // of this rank, of the others
   for (PetscInt j = 0; j < size; ++j) {
-    const auto free = [&](PetscInt k) { return k < size ? free_index_[dofs[k]] : -1; };
-    const PetscInt point = layout_->point_of[j], first = free(j);
+    const PetscInt point = layout_->point_of[j];
+    const auto free = [&](PetscInt k) { return k < size && layout_->point_of[k] == point ? free_index_[dofs[k]] : -1; };
+    const PetscInt first = free(j);
     if (first < 0) continue;
     Columns &c = columns[owned_[points[point]] ? 0 : 1];
-    const bool three = first + 1 == free(j + 1) && first + 2 == free(j + 2) && layout_->point_of[j + 2] == point;
+    const bool three = free(j + 1) == first + 1 && free(j + 2) == first + 2;
     (three ? c.threes[c.n_threes++] : c.ones[c.n_ones++]) = {j, point, first};
     if (three) j += 2;
   }
-  // lets the memory begin to bring the rows of the next cell, which would be waited for one after the other
+  // lets the memory begin to bring the rows of the next cell, which would be waited for one after the other (in vain
+  // where columns are of other ranks, which is harmless)
   if (cell + 1 < layout_->cells) {
     const PetscInt *next = layout_->cell_dofs(cell + 1), n = layout_->points;
     for (PetscInt i = 0; i < size; ++i) {
