@@ -13,6 +13,7 @@
 #include <filesystem>
 #include <fstream>
 #include <numeric>
+#include <set>
 #include <sstream>
 
 namespace pulmo {
@@ -156,6 +157,31 @@ std::string remembered_name(const MemorySpec &spec, std::size_t index)
   return name;
 }
 
+/// @p text as XML wants it: names of a mesh may hold what it keeps for itself.
+std::string in_xml(const std::string &text)
+{
+  std::string safe;
+  for (const char c : text) {
+    if (c == '&')
+      safe += "&amp;";
+    else if (c == '<')
+      safe += "&lt;";
+    else if (c == '>')
+      safe += "&gt;";
+    else
+      safe += c;
+  }
+  return safe;
+}
+
+/// @p wanted, or that with a number behind it if it is one of @p taken, to which it is added.
+std::string another_name(const std::string &wanted, std::set<std::string> &taken)
+{
+  std::string name = wanted;
+  for (int n = 2; !taken.insert(name).second; ++n) name = wanted + "_" + std::to_string(n);
+  return name;
+}
+
 /// The text of an XDMF file of grids of quadratic tetrahedra, whose values are in HDF5 files.
 class Xdmf {
 public:
@@ -167,7 +193,7 @@ public:
   /// A grid on the nodes and cells in @p mesh.
   void begin(const std::string &name, const std::string &mesh, std::optional<PetscReal> time)
   {
-    text << " <Grid Name=\"" << name << "\" GridType=\"Uniform\">\n";
+    text << " <Grid Name=\"" << in_xml(name) << "\" GridType=\"Uniform\">\n";
     if (time) text << "  <Time Value=\"" << *time << "\"/>\n";
     text << "  <Topology TopologyType=\"Tetrahedron_10\" NumberOfElements=\"" << cells_ << "\">";
     item(mesh, "topology", cells_, 10, "Int");
@@ -196,11 +222,11 @@ private:
     text << "<DataItem Format=\"HDF\" NumberType=\"" << type << "\" Precision=\""
          << (type[0] == 'I' ? sizeof(PetscInt) : 8) << "\" Dimensions=\"" << rows;
     if (columns > 1) text << " " << columns;
-    text << "\">" << h5 << ":/" << dataset << "</DataItem>";
+    text << "\">" << in_xml(h5 + ":/" + dataset) << "</DataItem>";
   }
   void attribute(const std::string &name, const char *centre, PetscInt rows, PetscInt columns, const std::string &h5)
   {
-    text << "  <Attribute Name=\"" << name << "\" AttributeType=\"" << (columns == 3 ? "Vector" : "Scalar")
+    text << "  <Attribute Name=\"" << in_xml(name) << "\" AttributeType=\"" << (columns == 3 ? "Vector" : "Scalar")
          << "\" Center=\"" << centre << "\">";
     item(h5, name, rows, columns, "Float");
     text << "</Attribute>\n";
@@ -230,6 +256,7 @@ PetscErrorCode FieldWriter::setup()
   const MPI_Comm comm = PetscObjectComm((PetscObject)model_.dm());
   const std::vector<std::string> &wanted = output_.fields_memory();
   std::vector<Remembered> offered;
+  std::set<std::string> taken;
   std::string names;
 
   PetscFunctionBeginUser;
@@ -237,7 +264,7 @@ PetscErrorCode FieldWriter::setup()
   for (const MemorySpec &spec : model_.composition().memories())
     for (std::size_t i = 0; i < spec.quantities.size(); ++i) {
       if (spec.quantities[i].unit.empty()) continue;
-      offered.push_back({&spec, i, remembered_name(spec, i)});
+      offered.push_back({&spec, i, another_name(remembered_name(spec, i), taken)});
       names += (names.empty() ? "" : ", ") + offered.back().name;
     }
   PulmoUserCheck(!offered.empty(), comm,
@@ -601,6 +628,7 @@ PetscErrorCode FieldWriter::write_cells(const std::string &name,
 {
   const MPI_Comm comm = PetscObjectComm((PetscObject)model_.dm());
   ValueFile file(comm);
+  std::set<std::string> taken;
 
   PetscFunctionBeginUser;
   if (!mesh_written_) PetscCall(write_mesh());
@@ -610,6 +638,7 @@ PetscErrorCode FieldWriter::write_cells(const std::string &name,
     std::string field = given; // a region's name may hold what a path in the file may not
     std::replace_if(
         field.begin(), field.end(), [](char c) { return c == '/' || c == ':'; }, '_');
+    field = another_name(field, taken); // "a/b" and "a_b"
     PetscCall(file.write(field, 1, cells));
     f.of_cells(field, name + ".h5");
   }
