@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <numeric>
 
 namespace pulmo {
 
@@ -11,6 +12,10 @@ namespace {
 
 /// Changes below this share of a number end the series: what a sweep leaves of its systems.
 constexpr double least = 1e-6;
+
+/// No limit where what follows the terms at hand is so much in doubt, as a share of the whole; nor where the whole is
+/// more than that of the number, which is no small change.
+constexpr double in_doubt = 0.05, small = 0.05;
 
 /// Times that differ by less than this share are the same.
 constexpr double same_time = 1e-9;
@@ -33,6 +38,22 @@ bool alike(const std::vector<Phase> &a, const std::vector<Phase> &b)
   });
 }
 
+/// The sum of @p terms and of those that follow, as a geometric series; empty where the terms do not look like one yet:
+/// their ratio rises from breath to breath until the slowest change of the lung is all that is left.
+std::optional<double> limit(const std::vector<double> &terms, double least_term)
+{
+  const std::size_t n = terms.size();
+  const double last = terms.back(), sum = std::accumulate(terms.begin(), terms.end(), 0.);
+  if (std::abs(last) <= least_term) return sum;
+  if (n < 2) return {};
+  const double ratio = last / terms[n - 2], before = n > 2 ? terms[n - 2] / terms[n - 3] : 0;
+  if (!(std::abs(ratio) < 1)) return {};
+  const double whole = sum + last * ratio / (1 - ratio);
+  const double doubt = std::abs(last * (ratio - before)) / ((1 - ratio) * (1 - ratio));
+  if (!(doubt <= in_doubt * std::abs(whole))) return {};
+  return whole;
+}
+
 } // namespace
 
 Periodicity::Periodicity(const Scene &scene, const std::vector<SignalRow> &rows, const Trajectory &trajectory)
@@ -53,7 +74,7 @@ Periodicity::Periodicity(const Scene &scene, const std::vector<SignalRow> &rows,
   const std::vector<Phase> repeated = phases_of(programme, rows[last_].breath);
   for (std::size_t i = breaths.size(), begin = last_; i-- > 0 && breaths[i].last == begin; begin = breaths[i].first) {
     if (!alike(phases_of(programme, rows[breaths[i].last].breath), repeated)) break;
-    shifts_.push_back({stage_of(breaths[i].first), from, to, {}});
+    shifts_.push_back({stage_of(breaths[i].first), from, to, {}, {}});
   }
   // one that differs from the breath before it is no breath among others
   if (breaths.size() > 1 && shifts_.size() == 1) shifts_.clear();
@@ -71,22 +92,14 @@ std::optional<MoreBreaths> Periodicity::change(const Functional &f, std::size_t 
   for (const Sweep::Shift &shift : shifts_) terms.push_back(shift.change[k]);
   if (!f.from_rest) { // the number looks at the start itself
     const SignalRow &from = rows_[first_], &to = rows_[last_];
-    const double volume = f.part ? f.part->volume[last_] - f.part->volume[first_] : to.volume - from.volume;
-    terms.front() += f.by_volume[first_] * volume +
+    terms.front() += f.by_volume[first_] * shifts_.front().volume[k] +
                      f.by_pressure[first_] * (to.machine_pressure() - from.machine_pressure()) +
                      f.by_flow[first_] * (to.flow - from.flow);
   }
   MoreBreaths more;
   more.next = terms.front();
-  double sum = 0;
-  for (const double term : terms) sum += term;
-  const double last = terms.back();
-  if (std::abs(last) <= least * std::abs(f.value))
-    more.periodic = sum;
-  else if (terms.size() > 1) {
-    const double ratio = last / terms[terms.size() - 2];
-    if (std::abs(ratio) < 1) more.periodic = sum + last * ratio / (1 - ratio);
-  }
+  more.periodic = limit(terms, least * std::abs(f.value));
+  if (more.periodic && std::abs(*more.periodic) > small * std::abs(f.value)) more.periodic = {};
   return more;
 }
 

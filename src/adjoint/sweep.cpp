@@ -306,7 +306,7 @@ PetscErrorCode Sweep::weighted_start(bool facets, std::vector<std::vector<PetscR
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Sweep::make_shifts(PetscInt stage, const Pending &pending)
+PetscErrorCode Sweep::make_shifts(const std::vector<Functional> &functionals, PetscInt stage, const Pending &pending)
 {
   const auto found = pending.find(stage);
 
@@ -314,7 +314,7 @@ PetscErrorCode Sweep::make_shifts(PetscInt stage, const Pending &pending)
   for (Shift *shift : shifts_) {
     if (shift->stage != stage) continue;
     shift->change.assign(count_, 0);
-    if (found == pending.end()) continue;
+    shift->volume.assign(count_, 0);
     const auto record = [&](PetscInt n) -> const StageRecord & {
       return trajectory_.stages()[static_cast<std::size_t>(n)];
     };
@@ -328,6 +328,24 @@ PetscErrorCode Sweep::make_shifts(PetscInt stage, const Pending &pending)
     PetscCall(trajectory_.state(shift->from, past_));
     PetscCall(trajectory_.state(shift->to, other_));
     PetscCall(VecAXPY(other_, -1, past_));
+    // to first order as all else is: what a prescribed flow makes of volume and state then cancels
+    const auto volume_change = [&](const std::vector<PetscInt> *part, PetscReal &sum) -> PetscErrorCode {
+      PetscReal own = 0;
+      PetscFunctionBeginUser;
+      PetscCall(VecZeroEntries(work_));
+      PetscCall(model_.add_volume_gradient(past_, nullptr, 1, work_, part));
+      PetscCall(VecDot(work_, other_, &own));
+      PetscCallMPI(MPI_Allreduce(&own, &sum, 1, MPIU_REAL, MPI_SUM, PetscObjectComm((PetscObject)model_.dm())));
+      PetscFunctionReturn(PETSC_SUCCESS);
+    };
+    PetscReal whole = 0;
+    PetscCall(volume_change(nullptr, whole));
+    for (std::size_t k = 0; k < count_; ++k) {
+      PetscReal looked_at = whole;
+      if (functionals[k].part) PetscCall(volume_change(&parts_[k], looked_at));
+      shift->volume[k] = looked_at / units::mm3_per_ml;
+    }
+    if (found == pending.end()) continue;
     if (memory_) {
       PetscCall(trajectory_.remembered(shift->from, before));
       PetscCall(trajectory_.remembered(shift->to, after));
@@ -339,7 +357,7 @@ PetscErrorCode Sweep::make_shifts(PetscInt stage, const Pending &pending)
       for (std::size_t i = 0; i < w.memory.size(); ++i) by_state += w.memory[i] * (after[i] - before[i]);
       PetscCallMPI(MPI_Allreduce(&by_state, &sum, 1, MPIU_REAL, MPI_SUM, PetscObjectComm((PetscObject)model_.dm())));
       for (std::size_t i = 0; i < w.scalars.size(); ++i) sum += w.scalars[i] * (to[i] - from[i]);
-      shift->change[k] = sum + w.volume * (volume(shift->to) - volume(shift->from)) + w.flow * flow + w.stored * stored;
+      shift->change[k] = sum + w.volume * whole + w.flow * flow + w.stored * stored;
     }
   }
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -477,7 +495,7 @@ PetscErrorCode Sweep::run(const std::vector<Functional> &functionals, PetscReal 
   for (auto n = static_cast<PetscInt>(stages.size()) - 1; n > 0 && failure.empty() && !stopped_; --n) {
     if (stop_request_) PetscCall(stop_request_->asked(stopped_));
     const StageRecord &record = stages[static_cast<std::size_t>(n)];
-    PetscCall(make_shifts(n, pending));
+    PetscCall(make_shifts(functionals, n, pending));
     want_row(functionals, n, pending);
     const auto found = pending.find(n);
     if (found == pending.end()) continue; // nothing depends on it
@@ -510,7 +528,7 @@ PetscErrorCode Sweep::run(const std::vector<Functional> &functionals, PetscReal 
     if (memory_ && failure.empty()) PetscCall(look_back_at_memory(result, pending));
     if (visit && failure.empty()) PetscCall(visit(result));
   }
-  PetscCall(make_shifts(0, pending));
+  PetscCall(make_shifts(functionals, 0, pending));
   start_ = std::move(pending[0]);
   PetscCall(KSPSetTolerances(ksp_, relative, absolute, PETSC_DEFAULT, PETSC_DEFAULT));
   PetscFunctionReturn(PETSC_SUCCESS);

@@ -84,6 +84,7 @@ public:
   struct Shift {
     PetscInt stage, from, to;
     std::vector<PetscReal> change; ///< [functional]: to first order, through later stages alone
+    std::vector<PetscReal> volume; ///< [functional]: what becomes of the volume it looks at, ml, to first order
   };
   /// Asks for Shift::change of @p shift, which must outlive the sweep.
   void ask_shift(Shift &shift) { shifts_.push_back(&shift); }
@@ -136,7 +137,7 @@ private:
   PetscErrorCode create(VecHandle &local) const;
   Wanted &wanted(Pending &pending, PetscInt stage, std::size_t functional) const;
   /// Fills in the changes of all shifts of a stage, of which @p pending is what later stages want.
-  PetscErrorCode make_shifts(PetscInt stage, const Pending &pending);
+  PetscErrorCode make_shifts(const std::vector<Functional> &functionals, PetscInt stage, const Pending &pending);
   void want_row(const std::vector<Functional> &functionals, PetscInt stage, Pending &pending) const;
   /// Adds a derivative by the pressure at the ventilator at the end of a stage, 1/kPa.
   void want_ventilator_pressure(PetscInt stage, PetscReal derivative, Wanted &wanted) const;
