@@ -54,6 +54,23 @@ std::optional<double> limit(const std::vector<double> &terms, double least_term)
   return whole;
 }
 
+/// Whether other loads than the ventilator's do in the breath @p later s after that of rows (first, last] what they do
+/// there.
+bool loads_repeat(const Scene &scene, const std::vector<SignalRow> &rows, std::size_t first, std::size_t last,
+                  PetscReal later)
+{
+  for (const auto &course : scene.facts().courses) {
+    PetscReal size = 0, difference = 0;
+    for (std::size_t i = first; i <= last; ++i) {
+      const PetscReal now = course(rows[i].time);
+      size = std::max(size, std::abs(now));
+      difference = std::max(difference, std::abs(course(rows[i].time + later) - now));
+    }
+    if (difference > least * size) return false;
+  }
+  return true;
+}
+
 } // namespace
 
 Periodicity::Periodicity(const Scene &scene, const std::vector<SignalRow> &rows, const Trajectory &trajectory)
@@ -72,8 +89,10 @@ Periodicity::Periodicity(const Scene &scene, const std::vector<SignalRow> &rows,
   last_ = breaths.back().last;
   const PetscInt from = stage_of(first_), to = stage_of(last_);
   const std::vector<Phase> repeated = phases_of(programme, rows[last_].breath);
+  if (!loads_repeat(scene, rows, first_, last_, rows[last_].time - rows[first_].time)) return;
   for (std::size_t i = breaths.size(), begin = last_; i-- > 0 && breaths[i].last == begin; begin = breaths[i].first) {
     if (!alike(phases_of(programme, rows[breaths[i].last].breath), repeated)) break;
+    if (!loads_repeat(scene, rows, first_, last_, rows[breaths[i].last].time - rows[last_].time)) break;
     shifts_.push_back({stage_of(breaths[i].first), from, to, {}, {}});
   }
   // one that differs from the breath before it is no breath among others

@@ -35,6 +35,17 @@ void LoadExpression::at(PetscReal t, const PetscReal x[3], PetscScalar value[]) 
   }
 }
 
+void announce_courses(const LoadExpression &load, SceneFacts &facts)
+{
+  for (std::size_t d = 0; !load.constant() && d < load.values.size(); ++d)
+    facts.courses.push_back([&load, d](PetscReal t) {
+      constexpr PetscReal somewhere[3] = {1, 2, 3};
+      std::vector<PetscScalar> values(load.values.size());
+      load.at(t, somewhere, values.data());
+      return values[d];
+    });
+}
+
 PetscErrorCode find_fault(MPI_Comm comm, const std::vector<const LoadExpression *> &loads, std::string &text)
 {
   PetscMPIInt rank, ranks, first;

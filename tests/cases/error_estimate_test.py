@@ -373,6 +373,16 @@ class SweptErrors(unittest.TestCase):
             case = pc.finished(scene + pc.programme(breath.format(8) + breath.format(last)) + ["-ts_dt", "0.1"] + SWEEP)
             self.assertEqual(bars(case)["tidal_volume_ml"]["more_breaths"] is not None, told)
 
+    def test_loads_that_differ(self):
+        """Breaths of 1.6 s under loads of another period: the next breath is none of those before."""
+        effort = ["-breathing_effort", "-breathing_effort_surfaces", "y0", "-breathing_effort_rise", "0.2", "-breathing_effort_hold", "0.1",
+                  "-breathing_effort_fall", "0.2", "-breathing_effort_period"]
+        pull = ["-traction", "-traction_surfaces", "y0", "-traction_value"]
+        for load, told in ((effort + ["0.8"], True), (effort + ["1.1"], False),
+                           (pull + ["0,0.01*sin(2*pi*t/1.6),0"], True), (pull + ["0,0.01*t,0"], False), (pull + ["0,0.01*x,0"], True)):
+            case = pc.finished(SCENE + ["-ts_dt", "0.2", "-ventilator_breaths", "2"] + load + SWEEP)
+            self.assertEqual(bars(case)["tidal_volume_ml"]["more_breaths"] is not None, told, load)
+
     def test_parts_of_the_lung(self):
         """The air of each lung, as regions have it, with bars of its own: what both lack is what the whole lacks."""
         names = ["-error_estimate_numbers", "V_T,V_T:right_lung,V_T:left_lung"]

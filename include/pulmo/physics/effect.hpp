@@ -634,6 +634,8 @@ struct SceneFacts {
   /// Its phases laid out again by its settings as they are now; @p settles: with a phase `settle` first.
   std::function<Programme(bool settles)> programme_again;
   std::vector<LoadTime> load_times; ///< of loads other than the ventilator's
+  /// What loads other than the ventilator's are at a time of the run, those that change with the place at one place.
+  std::vector<std::function<PetscReal(PetscReal t)>> courses;
   Settling settling;
   FlowSplit flow_split = FlowSplit::automatic;
   std::optional<AirwayResistance> tube;         ///< between ventilator and airway

@@ -49,6 +49,9 @@ private:
 /// nothing.
 PetscErrorCode find_fault(MPI_Comm comm, const std::vector<const LoadExpression *> &loads, std::string &text);
 
+/// Adds the components of @p load, which must outlive @p facts, to SceneFacts::courses.
+void announce_courses(const LoadExpression &load, SceneFacts &facts);
+
 /// User error if @p load has a value that cannot be used on the nodes of @p surface at t = 0.
 PetscErrorCode check_start(const Mesh &mesh, const std::string &surface, const LoadExpression &load);
 

@@ -159,6 +159,7 @@ public:
   PetscErrorCode announce(SceneFacts &facts) override
   {
     facts.pleural_suction = BreathingEffortKernels::pleural_suction;
+    facts.courses.push_back([this](PetscReal t) { return course_.at(t); });
     if (const auto time = course_.fastest())
       facts.load_times.push_back({*time, file_.empty() ? "rise or fall of -breathing_effort"
                                                        : "rise or fall of -breathing_effort_file " + file_});

@@ -125,6 +125,12 @@ public:
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
+  PetscErrorCode announce(SceneFacts &facts) override
+  {
+    for (std::size_t i = 0; i < surfaces_.size(); ++i) announce_courses(loads_[i], facts);
+    return PETSC_SUCCESS;
+  }
+
   PetscErrorCode terms(Composition &c, const SceneFacts &facts) const override
   {
     using K = TractionKernels;
