@@ -1,3 +1,5 @@
+/// @file
+/// The part of Sweep that is about the pressure at the opening and the scalar unknowns of effects.
 #include "pulmo/adjoint/sweep.hpp"
 
 #include "pulmo/mesh/mesh.hpp"

@@ -1,3 +1,5 @@
+/// @file
+/// Error bars by one sweep back over the run.
 #include "pulmo/program/error_estimate.hpp"
 
 #include "pulmo/adjoint/error_parts.hpp"
