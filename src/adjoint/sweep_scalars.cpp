@@ -1,5 +1,4 @@
-/// @file
-/// The part of Sweep that is about the pressure at the opening and the scalar unknowns of effects.
+// The part of Sweep that is about the pressure at the opening and the scalar unknowns of effects.
 #include "pulmo/adjoint/sweep.hpp"
 
 #include "pulmo/mesh/mesh.hpp"

@@ -1,5 +1,4 @@
-/// @file
-/// Error bars by one sweep back over the run.
+// Error bars by one sweep back over the run.
 #include "pulmo/program/error_estimate.hpp"
 
 #include "pulmo/adjoint/error_parts.hpp"
