@@ -651,7 +651,8 @@ TEST_P(AdjointIdentity, SweepAndTangentAgree)
     if (constant < 0 || *option.target == 0) continue;
     SCOPED_TRACE(option.option);
     ++found;
-    const PetscReal change = 1e-3 * std::abs(*option.target); // the same quotient on both sides, however good
+    // the same quotient on both sides, however good: so large that rounding of the residual does not count
+    const PetscReal change = 1e-2 * std::abs(*option.target);
     std::vector<PetscReal> swept(list.size(), 0), volume, pressure, flow;
     Sweep sweep(run.scene(), model, run.simulation(), trajectory);
     std::vector<std::vector<PetscReal>> at, moved;
