@@ -67,7 +67,7 @@ PetscErrorCode Enrichment::setup(Model &model)
 
   PetscFunctionBeginUser;
   run_ = &model;
-  // with a richer pressure no more than that takes: what the run has solved is solved here, too
+  // for a richer pressure no more than it takes: else what the run has solved would not be solved here
   rich_.integrate_to(std::max(model.quadrature_degree(), field_ == displacement ? exact : for_pressure));
   PetscCall(rich_.build(std::move(composition), model.modulus()));
   for (VecHandle *v : {&x_, &rate_, &diagonal_, &stiffness_, &work_, &other_}) {
@@ -224,8 +224,8 @@ void Enrichment::keep_block(const PetscInt *dofs, const PetscScalar *entries)
 {
   const CellLayout &layout = rich_.assembly().layout();
   const PetscInt n = layout.size;
-  std::vector<std::array<PetscInt, 2>>
-      nodes; // of each function, counted in the cell; the second: -1, or minus one there
+  // of each function, counted in the cell; the second: -1, or where it is minus one
+  std::vector<std::array<PetscInt, 2>> nodes;
   for (PetscInt i = 0; i < n; ++i) {
     const PetscInt function = function_of_[dofs[i]];
     if (function <= 0) continue;

@@ -377,7 +377,7 @@ PetscErrorCode add_derivatives(const Options &options, const Scene &scene, Model
       PetscCall(sum_up(options.comm(), sums));
       row.by_region.emplace_back(region.name, sums);
     }
-    if (!parameters[i].places.empty()) row.by_cell = std::move(by_cell[i]);
+    if (parameters[i].reader == Reader::kernels) row.by_cell = std::move(by_cell[i]);
   }
   for (std::size_t i = parameters.size(); i-- > 0;) {
     if (parameters[i].reader != Reader::kernels || parameters[i].effect == 0 || parameters[i].effect >= hidden)
@@ -393,7 +393,8 @@ PetscErrorCode add_derivatives(const Options &options, const Scene &scene, Model
 std::vector<std::pair<std::string, std::vector<double>>> Sensitivities::fields(const SensitivityReport &report) const
 {
   std::vector<std::pair<std::string, std::vector<double>>> list;
-  for (std::size_t k = 0; fields_ && k < report.numbers.size(); ++k)
+  if (!fields_ || !report.failure.empty()) return list; // the sums are of some steps only
+  for (std::size_t k = 0; k < report.numbers.size(); ++k)
     for (const SensitivityReport::Parameter &p : report.parameters)
       if (!p.by_cell.empty()) list.emplace_back(report.numbers[k].key + "_by_" + p.option.substr(1), p.by_cell[k]);
   return list;

@@ -330,12 +330,10 @@ PetscErrorCode Sweep::make_shifts(const std::vector<Functional> &functionals, Pe
     PetscCall(VecAXPY(other_, -1, past_));
     // to first order as all else is: what a prescribed flow makes of volume and state then cancels
     const auto volume_change = [&](const std::vector<PetscInt> *part, PetscReal &sum) -> PetscErrorCode {
-      PetscReal own = 0;
       PetscFunctionBeginUser;
       PetscCall(VecZeroEntries(work_));
       PetscCall(model_.add_volume_gradient(past_, nullptr, 1, work_, part));
-      PetscCall(VecDot(work_, other_, &own));
-      PetscCallMPI(MPI_Allreduce(&own, &sum, 1, MPIU_REAL, MPI_SUM, PetscObjectComm((PetscObject)model_.dm())));
+      PetscCall(dot(work_, other_, sum));
       PetscFunctionReturn(PETSC_SUCCESS);
     };
     PetscReal whole = 0;
@@ -352,12 +350,14 @@ PetscErrorCode Sweep::make_shifts(const std::vector<Functional> &functionals, Pe
     }
     for (std::size_t k = 0; k < count_; ++k) {
       const Wanted &w = found->second[k];
-      PetscReal by_state = 0, sum = 0;
-      if (w.state) PetscCall(VecDot(w.state, other_, &by_state));
-      for (std::size_t i = 0; i < w.memory.size(); ++i) by_state += w.memory[i] * (after[i] - before[i]);
-      PetscCallMPI(MPI_Allreduce(&by_state, &sum, 1, MPIU_REAL, MPI_SUM, PetscObjectComm((PetscObject)model_.dm())));
-      for (std::size_t i = 0; i < w.scalars.size(); ++i) sum += w.scalars[i] * (to[i] - from[i]);
-      shift->change[k] = sum + w.volume * whole + w.flow * flow + w.stored * stored;
+      PetscReal by_state = 0, by_memory = 0, by_scalars = 0;
+      if (w.state) PetscCall(dot(w.state, other_, by_state));
+      for (std::size_t i = 0; i < w.memory.size(); ++i) by_memory += w.memory[i] * (after[i] - before[i]);
+      if (memory_)
+        PetscCallMPI(
+            MPI_Allreduce(MPI_IN_PLACE, &by_memory, 1, MPIU_REAL, MPI_SUM, PetscObjectComm((PetscObject)model_.dm())));
+      for (std::size_t i = 0; i < w.scalars.size(); ++i) by_scalars += w.scalars[i] * (to[i] - from[i]);
+      shift->change[k] = by_state + by_memory + by_scalars + w.volume * whole + w.flow * flow + w.stored * stored;
     }
   }
   PetscFunctionReturn(PETSC_SUCCESS);

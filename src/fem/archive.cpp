@@ -13,7 +13,8 @@ namespace {
 
 /// Marks a file of pulmo, and tells how to read it. Raise it when a name or a meaning changes.
 constexpr const char *marker = "pulmo_checkpoint";
-// 2: the names of the mesh, the step sizes of phases; 3: what the solver left of its equations
+// 2: the names of the mesh, the step sizes of phases; 3: what the solver left of its equations; 4: when the
+// breath at hand is to end
 constexpr int format = 4;
 
 /// @p data is resized to what is there; @p type as in memory.

@@ -168,6 +168,8 @@ std::string in_xml(const std::string &text)
       safe += "&lt;";
     else if (c == '>')
       safe += "&gt;";
+    else if (c == '"')
+      safe += "&quot;";
     else
       safe += c;
   }

@@ -150,8 +150,9 @@ PetscErrorCode print_more_breaths(MPI_Comm comm, const std::vector<ErrorBar> &ba
                   100 * by / *bar.entry.value);
     list += (list.empty() ? "" : ", ") + std::string(text);
   }
-  PetscCall(PetscPrintf(comm, "  Breaths are not periodic yet, which no bar counts. %s will change: %s\n",
-                        limit ? "Until they are, numbers" : "With one more breath numbers", list.c_str()));
+  PetscCall(PetscPrintf(comm,
+                        "  Breaths are not periodic yet, and the bars do not include this. %s, these change: %s\n",
+                        limit ? "Until they are" : "With one more breath", list.c_str()));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

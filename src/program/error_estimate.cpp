@@ -164,11 +164,11 @@ PetscErrorCode ErrorEstimate::declare(Options &options)
                    "after the run, give each clinical number with its error in time, space and solver: by a sweep back "
                    "over the run, or by runs with steps 2 and 4 times as long, tighter tolerances and another mesh",
                    in_use_));
-  PetscCall(
-      options.text("mesh",
-                   "of runs, the other mesh: a coarser or finer one of the same lung; without it this one refined once "
-                   "(with -dm_refine: once less), which takes several times the memory",
-                   mesh_));
+  PetscCall(options.text(
+      "mesh",
+      "with more runs, the other mesh: a coarser or finer one of the same lung; without it this one refined once "
+      "(with -dm_refine: once less), which takes several times the memory",
+      mesh_));
   PetscCall(options.choice("method", {"sweep", "runs"},
                            "one sweep back over the run, or more runs; where it is not given sweep, if the scene has "
                            "nothing that keeps a sweep from it",

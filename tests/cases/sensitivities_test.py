@@ -113,15 +113,17 @@ class Sensitivities(unittest.TestCase):
                                                ranks=ranks), 1e-6)
 
     def test_breathing_effort(self):
-        self.differences(SCENE + ["-breathing_effort", "-breathing_effort_surfaces", "x0", "-breathing_effort_rise", "0.4",
-                                  "-breathing_effort_period", "1.2", "-breathing_effort_delay", "0.07"],
-                         ["-breathing_effort_" + name for name in ("pressure", "rise", "hold", "fall", "delay")],
+        scene = SCENE + ["-breathing_effort", "-breathing_effort_surfaces", "x0", "-breathing_effort_rise", "0.4",
+                         "-breathing_effort_period", "1.2", "-breathing_effort_delay", "0.07"]
+        self.by_cell(pc.finished(scene + ASK + ["-sensitivities_fields"], ranks=2))
+        self.differences(scene, ["-breathing_effort_" + name for name in ("pressure", "rise", "hold", "fall", "delay")],
                          ["resistance_cmH2O_s_per_l", "peak_inspiratory_pressure_cmH2O"])
 
     def test_a_solver_that_does_not_solve(self):
         """Twelve iterations are enough for Newton's method, and not for a sweep to twelve digits: told, and no derivative is given."""
         short = pc.finished(SCENE[:len(pc.BLOCK + pc.QUIET + pc.PAPER)] + pc.options_file("solvers/iterative.opts") +
-                            SCENE[len(pc.BLOCK + pc.QUIET + pc.PAPER + pc.DIRECT):] + ["-ksp_max_it", "12"] + ASK)
+                            SCENE[len(pc.BLOCK + pc.QUIET + pc.PAPER + pc.DIRECT):] + ["-ksp_max_it", "12", "-sensitivities_fields"] + ASK)
+        self.assertNotIn("sensitivities.h5", short.files(), "sums over some of the steps")
         self.assertIn("warning: no sensitivities: the solver leaves ", short.out)
         self.assertIn("direct.opts", short.json()["sensitivities"]["failure"])
         self.assertEqual(short.json()["sensitivities"]["numbers"], {})

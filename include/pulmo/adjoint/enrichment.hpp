@@ -37,8 +37,8 @@ public:
     Vec state;        ///< local, of the run
   };
   using ByCell = std::vector<std::vector<PetscReal>>; ///< [number][cell of this rank]
-  /// Adds the changes of the numbers by one stage to @p sums. @p matrix: of the stage, its diagonal is
-  /// looked at. @p left: null, or gets what the solver left of the equations, weighted by the multipliers of the run.
+  /// Adds the changes of the numbers by one stage to @p sums. @p matrix: of the stage, its diagonal is looked at.
+  /// @p left: null, or gets what the solver left of the equations, weighted by the multipliers of the run.
   PetscErrorCode add(const Sweep::Solved &stage, const std::vector<Later> &later, const std::vector<Past> &past,
                      Mat matrix, ByCell &sums, ByCell *left = nullptr);
 

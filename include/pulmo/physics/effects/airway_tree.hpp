@@ -177,8 +177,10 @@ public:
     PulmoUserCheck(facts.flow_split != FlowSplit::uniform, comm,
                    "-ventilator_flow_split uniform shares the flow by area, -airway_tree by resistance; leave one out");
     if (file_ == "star")
-      for (const std::string &surface : facts.airway_surfaces)
+      for (const std::string &surface : facts.airway_surfaces) {
         branches.push_back({surface, -1, 0, 0, 0, {{surface, ""}}});
+        set_resistance(branches.back());
+      }
     else
       PetscCall(read_branches(comm, branches));
     PetscCall(mesh.regions(regions));
@@ -198,7 +200,6 @@ public:
                        "-airway_tree: branch '%s' ends in '%s', and the mesh has no volume of that name; it has: %s",
                        branch.name.c_str(), part.region.c_str(), names.c_str());
       }
-    for (AirwayBranch &branch : branches) set_resistance(branch);
     network_ = std::make_shared<AirwayNetwork>(std::move(branches));
     PetscFunctionReturn(PETSC_SUCCESS);
   }
