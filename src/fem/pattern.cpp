@@ -1,5 +1,7 @@
 #include "pulmo/fem/pattern.hpp"
 
+#include "pulmo/fem/row_groups.hpp"
+
 #include <algorithm>
 #include <numeric>
 #include <petsc/private/dmimpl.h>
@@ -273,6 +275,7 @@ PetscErrorCode create_matrix(DM dm, Mat *A)
   PetscCall(pattern.setup(dm));
   PetscCall(pattern.allocate(*A));
   PetscCall(pattern.fill(*A));
+  PetscCall(group_rows(*A));
   PetscCall(PetscLogEventEnd(DM_CreateMatrix, dm, nullptr, nullptr, nullptr));
   PetscFunctionReturn(PETSC_SUCCESS);
 }

@@ -14,5 +14,6 @@ constexpr int max_nodes = 32;
 
 /// Eight: the components of a node, then their rates.
 typedef double Vector8 __attribute__((vector_size(64)));
+typedef double Vector8InArray __attribute__((vector_size(64), aligned(8), may_alias));
 
 } // namespace pulmo
