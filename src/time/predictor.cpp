@@ -36,10 +36,11 @@ PetscErrorCode Predictor::setup(Vec like)
   PetscFunctionBeginUser;
   if (increments_ == 0) PetscFunctionReturn(PETSC_SUCCESS);
   for (VecHandle *v : {&start_, &last_, &residual_, &foreseen_}) PetscCall(VecDuplicate(like, v->out()));
-  for (std::vector<VecHandle> *list : {&increment_, &direction_, &secant_}) {
+  for (std::vector<VecHandle> *list : {&increment_, &change_, &direction_, &secant_}) {
     list->resize(increments_);
     for (VecHandle &v : *list) PetscCall(VecDuplicate(like, v.out()));
   }
+  slope_.assign(increments_, 0);
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -69,14 +70,19 @@ PetscErrorCode Predictor::accept(Vec X)
 {
   PetscFunctionBeginUser;
   if (!in_use()) PetscFunctionReturn(PETSC_SUCCESS);
-  std::rotate(increment_.begin(), increment_.end() - 1, increment_.end());
+  for (auto *list : {&increment_, &change_}) std::rotate(list->begin(), list->end() - 1, list->end());
+  std::rotate(slope_.begin(), slope_.end() - 1, slope_.end());
   PetscCall(VecWAXPY(increment_.front(), -1, last_, X));
+  PetscCall(VecCopy(residual_, change_.front())); // the step took the residual that it began with to nothing
+  PetscCall(VecScale(change_.front(), -1));
+  slope_.front() = tried_;
   PetscCall(VecCopy(X, last_));
   known_ = std::min<PetscInt>(known_ + 1, increments_);
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Predictor::improve(SNES snes, const std::function<PetscErrorCode(Vec)> &hold, Vec X, PetscReal &norm)
+PetscErrorCode Predictor::improve(SNES snes, const std::function<PetscErrorCode(Vec)> &hold, PetscReal slope, Vec X,
+                                  PetscReal &norm)
 {
   PetscReal guess_norm;
   PetscInt n = 0;
@@ -84,18 +90,26 @@ PetscErrorCode Predictor::improve(SNES snes, const std::function<PetscErrorCode(
   PetscFunctionBeginUser;
   PetscCall(VecCopy(X, start_));
   PetscCall(residual_norm(snes, X, residual_, norm));
+  tried_ = std::isfinite(norm) ? slope : 0;
   PetscCall(VecCopy(residual_, foreseen_));
-  for (PetscInt i = 0; i < known_ && std::isfinite(norm); ++i) {
+  PetscInt recorded = 0; // not mixed with what is evaluated: secants of two kinds foresee less well
+  while (slope > 0 && recorded < known_ && slope_[recorded] == slope) ++recorded;
+  const PetscInt used = recorded > 0 ? recorded : known_;
+  for (PetscInt i = 0; i < used && std::isfinite(norm); ++i) {
     const Vec d = direction_[n], s = secant_[n];
     PetscReal before, after;
     PetscScalar along;
     PetscCall(VecCopy(increment_[i], d));
     PetscCall(hold(d));
-    PetscCall(VecAXPY(d, 1, start_));
-    PetscCall(residual_norm(snes, d, s, before));
-    if (!std::isfinite(before)) continue;
-    PetscCall(VecAXPY(d, -1, start_));
-    PetscCall(VecAXPY(s, -1, residual_));
+    if (recorded > 0) {
+      PetscCall(VecCopy(change_[i], s));
+    } else {
+      PetscCall(VecAXPY(d, 1, start_));
+      PetscCall(residual_norm(snes, d, s, before));
+      if (!std::isfinite(before)) continue;
+      PetscCall(VecAXPY(d, -1, start_));
+      PetscCall(VecAXPY(s, -1, residual_));
+    }
     PetscCall(VecNorm(s, NORM_2, &before));
     for (PetscInt j = 0; j < n; ++j) {
       PetscCall(VecDot(s, secant_[j], &along));

@@ -109,7 +109,9 @@ PetscErrorCode Simulation::guess(SNES snes, Vec X)
   PetscCall(airway_.guess(X));
   if (!predictor_.in_use()) PetscFunctionReturn(PETSC_SUCCESS);
   const auto hold = [this](Vec increment) { return airway_.hold(increment); };
-  PetscCall(predictor_.improve(snes, hold, X, start_norm_));
+  // with an opening pressure among the unknowns steps move more than the vector of them says
+  const PetscReal slope = airway_.mode() == Airway::Mode::solved ? 0 : scheme_.slope();
+  PetscCall(predictor_.improve(snes, hold, slope, X, start_norm_));
   inverted_ = false; // a guess was tried, no more
   PetscFunctionReturn(PETSC_SUCCESS);
 }

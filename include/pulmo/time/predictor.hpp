@@ -10,8 +10,9 @@
 namespace pulmo {
 
 /// Starts Newton at X + sum a_i d_i: d_i are the last accepted increments, a_i minimise the residual that the secants
-/// F(X + d_i) - F(X) foresee. A guess that does not lower the residual is dropped, so that a kink in time (a new phase,
-/// a reached limit) costs some residuals and no more.
+/// F(X + d_i) - F(X) foresee. Steps of the same length have left their secants behind: each took the residual that it
+/// began with to nothing. Where none has, they are evaluated. A guess that does not lower the residual is dropped, so
+/// that a kink in time (a new phase, a reached limit) costs some residuals and no more.
 class Predictor {
 public:
   /// Declares -predictor_increments.
@@ -27,13 +28,17 @@ public:
   PetscErrorCode accept(Vec X);
   /// Improves @p X, the state that a step starts from with the prescribed values of its end in place, and hands its
   /// residual to @p snes. @p hold zeroes the prescribed values in an increment. @p norm: of the residual at the start.
-  PetscErrorCode improve(SNES snes, const std::function<PetscErrorCode(Vec)> &hold, Vec X, PetscReal &norm);
+  /// @p slope: how the step makes rates of states (Stage), 1/s; 0: secants of other steps are of no use.
+  PetscErrorCode improve(SNES snes, const std::function<PetscErrorCode(Vec)> &hold, PetscReal slope, Vec X,
+                         PetscReal &norm);
 
 private:
   PetscInt increments_ = 0, known_ = 0; ///< how many to use; how many there are
   VecHandle last_;                      ///< the last accepted state
   VecHandle start_, residual_, foreseen_;
-  std::vector<VecHandle> increment_;          ///< the last one first
+  std::vector<VecHandle> increment_, change_; ///< the last one first
+  std::vector<PetscReal> slope_;
+  PetscReal tried_ = 0;
   std::vector<VecHandle> direction_, secant_; ///< secants orthonormal
 };
 
