@@ -17,7 +17,7 @@ namespace {
 
 // ------------------------------------------------------------------------------------------------- callbacks
 
-/// Calls one callback at all points of a cell, timed if the log asks for it.
+/// Calls one callback once for all points of a cell, timed if the log asks for it.
 class Caller {
 public:
   Caller(const PointData &d, PetscReal time, PetscReal time_shift, PetscInt n_constants, const PetscScalar *c,
@@ -29,33 +29,30 @@ public:
   void operator()(PetscPointFunc f, PetscScalar *out, PetscInt stride) const
   {
     const Clock clock(*this, reinterpret_cast<void (*)(void)>(f));
-    for (PetscInt q = 0; q < data.fields->points; ++q)
-      f(dim, data.fields->n, precomputed_state, data.fields->uOff, data.fields->uOff_x, u(q), u_t(q), u_x(q), nullptr,
-        data.fields->uOff_x, state(q), memory(q), rate_x(q), t, data.x + q * dim, nc, constants, out + q * stride);
+    const PointBatch batch = points(stride);
+    f(dim, fields().n, all_points, fields().uOff, fields().uOff_x, data.u, data.u_t, data.u_x, nullptr, fields().uOff_x,
+      scalars(batch), nullptr, data.rate_x, t, data.x, nc, constants, out);
   }
   void operator()(PetscPointJac g, PetscScalar *out, PetscInt stride) const
   {
     const Clock clock(*this, reinterpret_cast<void (*)(void)>(g));
-    for (PetscInt q = 0; q < data.fields->points; ++q)
-      g(dim, data.fields->n, precomputed_state, data.fields->uOff, data.fields->uOff_x, u(q), u_t(q), u_x(q), nullptr,
-        data.fields->uOff_x, state(q), memory(q), rate_x(q), t, shift, data.x + q * dim, nc, constants,
-        out + q * stride);
+    const PointBatch batch = points(stride);
+    g(dim, fields().n, all_points, fields().uOff, fields().uOff_x, data.u, data.u_t, data.u_x, nullptr, fields().uOff_x,
+      scalars(batch), nullptr, data.rate_x, t, shift, data.x, nc, constants, out);
   }
   void operator()(PetscBdPointFunc f, PetscScalar *out, PetscInt stride) const
   {
     const Clock clock(*this, reinterpret_cast<void (*)(void)>(f));
-    for (PetscInt q = 0; q < data.fields->points; ++q)
-      f(dim, data.fields->n, precomputed_state, data.fields->uOff, data.fields->uOff_x, u(q), u_t(q), u_x(q), nullptr,
-        data.fields->uOff_x, state(q), memory(q), rate_x(q), t, data.x + q * dim, data.normals + q * dim, nc, constants,
-        out + q * stride);
+    const PointBatch batch = points(stride);
+    f(dim, fields().n, all_points, fields().uOff, fields().uOff_x, data.u, data.u_t, data.u_x, nullptr, fields().uOff_x,
+      scalars(batch), nullptr, data.rate_x, t, data.x, data.normals, nc, constants, out);
   }
   void operator()(PetscBdPointJac g, PetscScalar *out, PetscInt stride) const
   {
     const Clock clock(*this, reinterpret_cast<void (*)(void)>(g));
-    for (PetscInt q = 0; q < data.fields->points; ++q)
-      g(dim, data.fields->n, precomputed_state, data.fields->uOff, data.fields->uOff_x, u(q), u_t(q), u_x(q), nullptr,
-        data.fields->uOff_x, state(q), memory(q), rate_x(q), t, shift, data.x + q * dim, data.normals + q * dim, nc,
-        constants, out + q * stride);
+    const PointBatch batch = points(stride);
+    g(dim, fields().n, all_points, fields().uOff, fields().uOff_x, data.u, data.u_t, data.u_x, nullptr, fields().uOff_x,
+      scalars(batch), nullptr, data.rate_x, t, shift, data.x, data.normals, nc, constants, out);
   }
 
 private:
@@ -81,15 +78,13 @@ private:
     PetscLogDouble start_ = 0;
   };
 
-  const PetscScalar *u(PetscInt q) const { return data.u + q * data.fields->total_components; }
-  const PetscScalar *u_t(PetscInt q) const { return data.u_t + q * data.fields->total_components; }
-  const PetscScalar *u_x(PetscInt q) const { return data.u_x + q * data.fields->total_components * dim; }
-  const PetscScalar *rate_x(PetscInt q) const { return data.rate_x + q * data.fields->total_components * dim; }
-  const PetscScalar *memory(PetscInt q) const
+  const TabulatedFields &fields() const { return *data.fields; }
+  PointBatch points(PetscInt stride) const
   {
-    return data.memory.empty() ? nullptr : reinterpret_cast<const PetscScalar *>(&data.memory[q]);
+    return {fields().points, fields().total_components, stride, data.states.data(),
+            data.memory.empty() ? nullptr : data.memory.data()};
   }
-  const PetscScalar *state(PetscInt q) const { return reinterpret_cast<const PetscScalar *>(&data.states[q]); }
+  static const PetscScalar *scalars(const PointBatch &batch) { return reinterpret_cast<const PetscScalar *>(&batch); }
 
   const PointData &data;
   PetscReal t, shift;
@@ -202,15 +197,16 @@ public:
 
     data.fields = &fields_[facets_ ? geom_->face[e][0] : 0];
     data.evaluate(inverse, coefficients + e * size, coefficients_t ? coefficients_t + e * size : nullptr);
-    for (PetscInt q = 0; q < data.fields->points; ++q) {
+    const PetscInt n_points = data.fields->points;
+    for (PetscInt q = 0; q < n_points; ++q) {
+      const PetscReal *at = reference_ + q * manifold;
+      const PetscReal r[dim] = {at[0] - origin[0], at[1] - origin[1], facets_ ? 0 : at[2] - origin[2]};
       data.weights[q] = weights_[q] * geom_->detJ[e * stride];
-      for (PetscInt i = 0; i < dim; ++i) {
-        data.x[q * dim + i] = v[i];
-        for (PetscInt d = 0; d < manifold; ++d)
-          data.x[q * dim + i] += J[i * dim + d] * (reference_[q * manifold + d] - origin[d]);
-        if (facets_) data.normals[q * dim + i] = geom_->n[e * stride * dim + i];
-      }
+      for (PetscInt i = 0; i < dim; ++i)
+        data.x[q * dim + i] = v[i] + J[i * dim] * r[0] + J[i * dim + 1] * r[1] + J[i * dim + 2] * r[2];
     }
+    if (facets_)
+      for (PetscInt q = 0; q < n_points; ++q) std::copy_n(geom_->n + e * stride * dim, dim, data.normals + q * dim);
   }
 
   PetscInt n_constants = 0;

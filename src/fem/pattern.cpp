@@ -1,5 +1,6 @@
 #include "pulmo/fem/pattern.hpp"
 
+#include "pulmo/base/huge_pages.hpp"
 #include "pulmo/fem/row_groups.hpp"
 
 #include <algorithm>
@@ -230,6 +231,15 @@ PetscErrorCode Pattern::allocate(Mat A) const
   }
   PetscCall(MatSeqAIJSetPreallocation(A, 0, here.data()));
   PetscCall(MatMPIAIJSetPreallocation(A, 0, here.data(), 0, elsewhere.data()));
+
+  PetscBool parallel;
+  Mat owned = A;
+  PetscScalar *entries;
+  PetscCall(PetscObjectBaseTypeCompare((PetscObject)A, MATMPIAIJ, &parallel));
+  if (parallel) PetscCall(MatMPIAIJGetSeqAIJ(A, &owned, nullptr, nullptr));
+  PetscCall(MatSeqAIJGetArray(owned, &entries));
+  prefer_huge_pages(entries, sizeof(*entries) * std::accumulate(here.begin(), here.end(), std::size_t(0)));
+  PetscCall(MatSeqAIJRestoreArray(owned, &entries));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -10,6 +10,9 @@ namespace {
 /// A secant that is shorter than this share of itself after the others were taken out of it says nothing new.
 constexpr PetscReal independent = 1e-6;
 
+/// So many secants are evaluated at most, a residual each; those that steps left behind cost nothing.
+constexpr PetscInt most_evaluated = 3;
+
 /// Norm of the residual F(X); infinite where it is not defined (J <= 0, no air).
 PetscErrorCode residual_norm(SNES snes, Vec X, Vec F, PetscReal &norm)
 {
@@ -94,7 +97,7 @@ PetscErrorCode Predictor::improve(SNES snes, const std::function<PetscErrorCode(
   PetscCall(VecCopy(residual_, foreseen_));
   PetscInt recorded = 0; // not mixed with what is evaluated: secants of two kinds foresee less well
   while (slope > 0 && recorded < known_ && slope_[recorded] == slope) ++recorded;
-  const PetscInt used = recorded > 0 ? recorded : known_;
+  const PetscInt used = recorded > 0 ? recorded : std::min(known_, most_evaluated);
   for (PetscInt i = 0; i < used && std::isfinite(norm); ++i) {
     const Vec d = direction_[n], s = secant_[n];
     PetscReal before, after;

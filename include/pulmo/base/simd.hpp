@@ -4,6 +4,9 @@
 
 namespace pulmo {
 
+/// Two doubles: a scalar field at a node, then its rate.
+typedef double Vector2 __attribute__((vector_size(16)));
+
 /// Four doubles: the components of a node, or four entries of a row.
 typedef double Vector4 __attribute__((vector_size(32)));
 /// Four that lie in an array, at any address of a double. A template that deduces its type forgets that.

@@ -124,33 +124,46 @@ private:
     }
   }
 
-  /// Values and gradients of field @p f and of its rate at all points.
   void evaluate(PetscInt f, const PetscScalar coefficients[], const PetscScalar coefficients_t[])
   {
-    const ScalarBasis &basis = fields->basis[f];
-    const PetscInt C = basis.components, Nc = fields->total_components;
-    Vector8 node[max_nodes];
-    const auto entry = [&](const PetscScalar *list, PetscInt a, PetscInt c) {
-      return list && c < C ? list[basis.offset + a * C + c] : 0;
-    };
-    for (PetscInt a = 0; a < basis.nodes; ++a) {
-      const PetscScalar *e = coefficients, *e_t = coefficients_t;
-      node[a] = Vector8{entry(e, a, 0),   entry(e, a, 1),   entry(e, a, 2),   0,
-                        entry(e_t, a, 0), entry(e_t, a, 1), entry(e_t, a, 2), 0};
+    switch (fields->basis[f].components) {
+    case 1:
+      evaluate_components<1, Vector2>(f, coefficients, coefficients_t);
+      break;
+    case 2:
+      evaluate_components<2, Vector8>(f, coefficients, coefficients_t);
+      break;
+    default:
+      evaluate_components<3, Vector8>(f, coefficients, coefficients_t);
     }
+  }
+
+  /// Values and gradients of field @p f of @p C components and of its rate at all points. @p V: the components of a
+  /// node, then, in its second half, their rates.
+  template <PetscInt C, class V>
+  void evaluate_components(PetscInt f, const PetscScalar coefficients[], const PetscScalar coefficients_t[])
+  {
+    constexpr int half = sizeof(V) / sizeof(PetscScalar) / 2;
+    const ScalarBasis &basis = fields->basis[f];
+    const PetscInt Nc = fields->total_components, n = basis.nodes;
+    V node[max_nodes] = {};
+    for (PetscInt a = 0; a < n; ++a)
+      for (int c = 0; c < C; ++c) {
+        node[a][c] = coefficients[basis.offset + a * C + c];
+        if (coefficients_t) node[a][half + c] = coefficients_t[basis.offset + a * C + c];
+      }
     for (PetscInt q = 0; q < fields->points; ++q) {
-      Vector8 s, g[dim];
+      V s, g[dim];
       interpolate(basis, q, inverse_J, node, s, g);
       PetscScalar *value = u + q * Nc + fields->uOff[f], *rate = u_t + q * Nc + fields->uOff[f];
-      for (PetscInt c = 0; c < C; ++c) {
+      PetscScalar *gradient = u_x + q * Nc * dim + fields->uOff_x[f];
+      PetscScalar *gradient_t = rate_x + q * Nc * dim + fields->uOff_x[f];
+      for (int c = 0; c < C; ++c) {
         value[c] = s[c];
-        rate[c] = s[4 + c];
-      }
-      for (PetscInt d = 0; d < dim; ++d) {
-        const PetscInt place = q * Nc * dim + fields->uOff_x[f] + d;
-        for (PetscInt c = 0; c < C; ++c) {
-          u_x[place + c * dim] = g[d][c];
-          rate_x[place + c * dim] = g[d][4 + c];
+        rate[c] = s[half + c];
+        for (int d = 0; d < dim; ++d) {
+          gradient[c * dim + d] = g[d][c];
+          gradient_t[c * dim + d] = g[d][half + c];
         }
       }
     }

@@ -238,6 +238,19 @@ struct Point {
 /// its rates the Memory of all effects or null.
 constexpr PetscInt precomputed_state = -1;
 
+/// NfAux that says: all points of a cell or facet at once, of which pulmo's integrator hands over the first. The
+/// auxiliary array is a PointBatch; all other arrays go on from point to point. Parameters are then looked up once.
+constexpr PetscInt all_points = -2;
+
+/// The points of a call for all of them.
+struct PointBatch {
+  PetscInt n;               ///< how many
+  PetscInt components;      ///< of all fields at a point
+  PetscInt stride;          ///< of the output, from point to point
+  const PointState *states; ///< [point]
+  const Memory *memory;     ///< [point], of all effects; null: nothing is remembered here
+};
+
 template <class P>
 using Kernel = void (*)(const Point &, const P &, PetscScalar[]);
 
@@ -256,7 +269,8 @@ PULMO_ALWAYS_INLINE Point make_point(PointState &storage, PetscInt Nf, PetscInt 
                                      const PetscInt uOff_x[], const PetscScalar u[], const PetscScalar u_t[],
                                      const PetscScalar u_x[], const PetscInt aOff_x[], const PetscScalar a[],
                                      const PetscScalar a_t[], const PetscScalar a_x[], PetscReal t, PetscReal shift,
-                                     const PetscReal x[], const PetscReal normal[], const PetscScalar c[])
+                                     const PetscReal x[], const PetscReal normal[], const Step &step,
+                                     const PetscScalar c[])
 {
   const bool made = NfAux == precomputed_state, gas = Nf > pressure;
   if (!made) make_point_state(u_x + uOff_x[displacement], NfAux > 0 ? a_x + aOff_x[displacement] : nullptr, storage);
@@ -276,7 +290,7 @@ PULMO_ALWAYS_INLINE Point make_point(PointState &storage, PetscInt Nf, PetscInt 
           shift,
           x,
           normal,
-          constants::get<Step>(c),
+          step,
           u_t ? u_t + uOff[displacement] : nullptr,
           gas && u_t ? u_t[uOff[pressure]] : 0,
           gas && a_x && (made || NfAux > pressure) ? a_x + aOff_x[pressure] : nullptr,
@@ -285,46 +299,66 @@ PULMO_ALWAYS_INLINE Point make_point(PointState &storage, PetscInt Nf, PetscInt 
           all};
 }
 
+/// Calls kernel @p K at the point of a callback, or at all points of a cell or facet.
+template <class P, Kernel<P> K>
+PULMO_ALWAYS_INLINE void call_kernel(PetscInt Nf, PetscInt NfAux, const PetscInt uOff[], const PetscInt uOff_x[],
+                                     const PetscScalar u[], const PetscScalar u_t[], const PetscScalar u_x[],
+                                     const PetscInt aOff_x[], const PetscScalar a[], const PetscScalar a_t[],
+                                     const PetscScalar a_x[], PetscReal t, PetscReal shift, const PetscReal x[],
+                                     const PetscReal normal[], const PetscScalar c[], PetscScalar out[])
+{
+  const P parameters = constants::get<P>(c);
+  const Step step = constants::get<Step>(c);
+  PointState storage;
+  if (NfAux != all_points) {
+    K(make_point<P>(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_t, a_x, t, shift, x, normal, step, c),
+      parameters, out);
+    return;
+  }
+  const PointBatch &batch = *reinterpret_cast<const PointBatch *>(a);
+  for (PetscInt q = 0; q < batch.n; ++q) {
+    const PetscInt i = q * batch.components, i_x = 3 * i;
+    K(make_point<P>(storage, Nf, precomputed_state, uOff, uOff_x, u + i, u_t + i, u_x + i_x, aOff_x,
+                    reinterpret_cast<const PetscScalar *>(&batch.states[q]),
+                    batch.memory ? reinterpret_cast<const PetscScalar *>(&batch.memory[q]) : nullptr, a_x + i_x, t,
+                    shift, x + 3 * q, normal ? normal + 3 * q : nullptr, step, c),
+      parameters, out + q * batch.stride);
+  }
+}
+
 template <class P, Kernel<P> K>
 void volume_residual(PULMO_POINT_ARGUMENTS, const PetscReal x[], PetscInt, const PetscScalar c[], PetscScalar f[])
 {
-  PointState storage;
-  K(make_point<P>(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_t, a_x, t, 0, x, nullptr, c),
-    constants::get<P>(c), f);
+  call_kernel<P, K>(Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_t, a_x, t, 0, x, nullptr, c, f);
 }
 
 template <class P, Kernel<P> K>
 void volume_jacobian(PULMO_POINT_ARGUMENTS, PetscReal shift, const PetscReal x[], PetscInt, const PetscScalar c[],
                      PetscScalar g[])
 {
-  PointState storage;
-  K(make_point<P>(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_t, a_x, t, shift, x, nullptr, c),
-    constants::get<P>(c), g);
+  call_kernel<P, K>(Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_t, a_x, t, shift, x, nullptr, c, g);
 }
 
 template <class P, Kernel<P> K>
 void surface_residual(PULMO_POINT_ARGUMENTS, const PetscReal x[], const PetscReal n[], PetscInt, const PetscScalar c[],
                       PetscScalar f[])
 {
-  PointState storage;
-  K(make_point<P>(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_t, a_x, t, 0, x, n, c),
-    constants::get<P>(c), f);
+  call_kernel<P, K>(Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_t, a_x, t, 0, x, n, c, f);
 }
 
 template <class P, Kernel<P> K>
 void surface_jacobian(PULMO_POINT_ARGUMENTS, PetscReal shift, const PetscReal x[], const PetscReal n[], PetscInt,
                       const PetscScalar c[], PetscScalar g[])
 {
-  PointState storage;
-  K(make_point<P>(storage, Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_t, a_x, t, shift, x, n, c),
-    constants::get<P>(c), g);
+  call_kernel<P, K>(Nf, NfAux, uOff, uOff_x, u, u_t, u_x, aOff_x, a, a_t, a_x, t, shift, x, n, c, g);
 }
 
 } // namespace detail
 
 #undef PULMO_POINT_ARGUMENTS
 
-/// A callback and the owners of the parameters that it reads (null: none).
+/// A callback and the owners of the parameters that it reads (null: none). One of a residual or Jacobian term is made
+/// by the adaptors below: pulmo's integrator calls it for all_points.
 template <class F>
 struct Callback {
   F function = nullptr;
