@@ -1,6 +1,7 @@
 #include "pulmo/fem/pattern.hpp"
 
 #include "pulmo/base/huge_pages.hpp"
+#include "pulmo/fem/field_blocks.hpp"
 #include "pulmo/fem/row_groups.hpp"
 
 #include <algorithm>
@@ -286,6 +287,7 @@ PetscErrorCode create_matrix(DM dm, Mat *A)
   PetscCall(pattern.allocate(*A));
   PetscCall(pattern.fill(*A));
   PetscCall(group_rows(*A));
+  PetscCall(copy_blocks_in_order(*A));
   PetscCall(PetscLogEventEnd(DM_CreateMatrix, dm, nullptr, nullptr, nullptr));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
