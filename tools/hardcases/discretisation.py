@@ -258,7 +258,7 @@ def undrained(lab):
 
 
 @case("Stretched cells (100 : 1), slivers, cells with all nodes on the boundary",
-      "the first step's closed form within 2 % rms; order of the plates; Krylov count", "finer plates, 200 : 1, Krylov counts")
+      "the first step's closed form within 2 % rms; order of the plates beside that of P1 elements for the pressure alone; Krylov count", "finer plates, 200 : 1, Krylov counts")
 def bad_cells(lab):
     """Gradients across flat cells cancel, smoothers and AMG see couplings 10⁴ apart, and a cell without an inner node has
     little freedom."""
