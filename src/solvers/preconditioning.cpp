@@ -455,21 +455,25 @@ PetscErrorCode FixedStress::add(PetscInt c, const PetscScalar *matrix, const Pet
 {
   const PetscInt nu = n_u_, size = nu + n_p_;
   const PetscReal *w = &position_[c * nu];
-  PetscScalar stiffness = 0, storage = 0, load = 0, S[max_nodes * max_nodes];
+  PetscScalar bulk = 0, wave = 0, storage = 0, load = 0, S[max_nodes * max_nodes];
 
   PetscFunctionBeginHot;
   for (PetscInt i = 0; i < size; ++i) {
     const PetscScalar *row = matrix + i * size;
-    PetscScalar along = 0; // of this row in direction w
-    for (PetscInt j = 0; j < nu; ++j) along += row[j] * w[j];
+    PetscScalar along[3] = {0, 0, 0}; // of this row in direction w, by components of w
+    for (PetscInt j = 0; j < nu; j += 3)
+      for (PetscInt d = 0; d < 3; ++d) along[d] += row[j + d] * w[j + d];
+    const PetscScalar all = along[0] + along[1] + along[2];
     if (i >= nu) {
-      storage += along * row_scale[pressure];
+      storage += all * row_scale[pressure];
     } else {
-      stiffness += w[i] * along * row_scale[displacement];
+      bulk += w[i] * all * row_scale[displacement];
+      wave += 3 * w[i] * along[i % 3] * row_scale[displacement];
       for (PetscInt j = nu; j < size; ++j) load += w[i] * row[j] * row_scale[displacement];
     }
   }
-  // S - A_pp is positive where the tissue stands a dilation; elsewhere (softening) nothing is added
+  // K may vanish or be negative where the tissue softens; M is positive as long as the tissue is elliptic
+  const PetscScalar stiffness = std::max((3 * bulk + 2 * wave) / 5, wave / 4);
   const PetscScalar c_e = stiffness > 0 ? -storage * load / stiffness : 0;
   for (PetscInt a = 0; a < n_p_; ++a)
     for (PetscInt b = 0; b < n_p_; ++b)

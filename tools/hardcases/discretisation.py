@@ -36,18 +36,40 @@ def first_step(x, length, k, dt):
     return 1 - np.exp((x - length) / layer) * (1 + np.exp(-2 * x / layer)) / (1 + np.exp(-2 * length / layer))
 
 
-def projected(x, cells, drained):
-    """P1 projection (L2) of p/p0 = 1 with p = 0 at the drained nodes: what the mesh can show of a layer without thickness."""
+def mass(x, cells):
+    """Volumes of the cells and P1's mass matrix."""
     corners = x[cells]
     volume = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / 6
-    local = (np.ones((4, 4)) + np.eye(4)) / 20
+    return volume, matrix(volume[:, None, None] * (np.ones((4, 4)) + np.eye(4)) / 20, cells, len(x))
+
+
+def matrix(local, cells, n):
     rows, columns = np.repeat(cells, 4, axis=1).ravel(), np.tile(cells, 4).ravel()
-    mass = sp.coo_matrix(((volume[:, None, None] * local).ravel(), (rows, columns)), shape=(len(x),) * 2).tocsr()
-    inner = ~drained & np.isin(np.arange(len(x)), cells)
-    load = np.bincount(cells.ravel(), np.repeat(volume / 4, 4), minlength=len(x))
-    p = np.zeros(len(x))
-    p[inner] = spsolve(mass[inner][:, inner].tocsc(), load[inner])
+    return sp.coo_matrix((local.ravel(), (rows, columns)), shape=(n, n)).tocsr()
+
+
+def inner_solution(A, load, cells, drained):
+    """x of A x = load with x = 0 at the drained nodes."""
+    inner = ~drained & np.isin(np.arange(len(load)), cells)
+    p = np.zeros(len(load))
+    p[inner] = spsolve(A[inner][:, inner].tocsc(), load[inner])
     return p
+
+
+def projected(x, cells, drained):
+    """P1 projection (L2) of p/p0 = 1 with p = 0 at the drained nodes: what the mesh can show of a layer without thickness."""
+    volume, M = mass(x, cells)
+    return inner_solution(M, np.bincount(cells.ravel(), np.repeat(volume / 4, 4), minlength=len(x)), cells, drained)
+
+
+def pressure_alone(x, cells, drained, c_dt):
+    """p/p0 after the first step by P1 elements with the displacement eliminated, p − c_v Δt Δp = p0: of all P1 functions on
+    this mesh the nearest to the closed form in the norm of that equation."""
+    volume, M = mass(x, cells)
+    inverse = np.linalg.inv(x[cells[:, 1:]] - x[cells[:, :1]])
+    slopes = np.concatenate([-inverse.sum(axis=2)[:, :, None], inverse], axis=2)
+    A = M + c_dt * matrix(volume[:, None, None] * np.einsum("cdi,cdj->cij", slopes, slopes), cells, len(x))
+    return inner_solution(A, M @ np.isin(np.arange(len(x)), cells), cells, drained)
 
 
 def pressures(run):
@@ -236,7 +258,7 @@ def undrained(lab):
 
 
 @case("Stretched cells (100 : 1), slivers, cells with all nodes on the boundary",
-      "the first step's closed form within 2 % rms; order of the plates; Krylov count", "finer plates, 200 : 1, Krylov counts")
+      "the first step's closed form within 2 % rms; order of the plates beside that of P1 elements for the pressure alone; Krylov count", "finer plates, 200 : 1, Krylov counts")
 def bad_cells(lab):
     """Gradients across flat cells cancel, smoothers and AMG see couplings 10⁴ apart, and a cell without an inner node has
     little freedom."""
@@ -258,17 +280,27 @@ def bad_cells(lab):
             run = lab.finished(column(mesh, BOX_SIDES, k, dt, dt, solver=file), f"{name}, {solver}")
             if run is None:
                 continue
-            x, p, _, vertices = pressures(run)
-            error = np.sqrt(np.mean((p - first_step(x[:, 0], length, k, dt))[vertices] ** 2))
+            x, p, corners, vertices = pressures(run)
+            exact = first_step(x[:, 0], length, k, dt)
+            error = np.sqrt(np.mean((p - exact)[vertices] ** 2))
             errors[name, solver] = error
+            alone = pressure_alone(x, corners, np.isclose(x[:, 0], length), k * MODULUS * dt)
+            errors[name, "pressure alone"] = np.sqrt(np.mean((alone - exact)[vertices] ** 2))
             lab.below(f"{name}, {solver}: rms error of p/p0 against the closed form", error, 0.02)
             if solver == "iterative" and not lab.small:
                 numbers = run.json()
                 lab.below(f"{name}: Krylov per Newton iteration", numbers["krylov_iterations"] / numbers["newton_iterations"], 30)
     if not lab.small:
-        both = [errors.get((f"plates 100 : 1{finer}", "direct")) for finer in ("", ", finer")]
-        if all(both):
-            lab.above("plates: order of the rms error of p", np.log2(both[0] / both[1]), 1.5)
+        # cells of 10 and 5 mm across a layer of 0.2 mm: the order is 1.26 for P1 elements without any displacement, too, and
+        # nears 2 only with cells as small as the layer. More than these meshes can show is not asked
+        names = ["plates 100 : 1", "plates 100 : 1, finer"]
+        if all((name, "direct") in errors for name in names):
+            orders = {by: np.log2(errors[names[0], by] / errors[names[1], by]) for by in ("direct", "pressure alone")}
+            lab.within("plates: order of the rms error of p beside that of P1 elements for the pressure alone, the same mesh",
+                       orders["direct"], orders["pressure alone"], 0.02)
+            for name in names:
+                lab.below(f"{name}: rms error of p over that of P1 elements for the pressure alone, the same mesh",
+                          errors[name, "direct"] / errors[name, "pressure alone"], 1)
         lab.finished(column(meshes.box_options((2 * n, 2, 2), (length, 20, 20)), BOX_SIDES, k, dt, dt, solver=ITERATIVE),
                      "plates 200 : 1, iterative")
     # one cube of six cells, all nodes on its boundary

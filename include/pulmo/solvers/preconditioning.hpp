@@ -24,10 +24,13 @@ PetscErrorCode wanted_pc(MPI_Comm comm, std::string &type);
 PetscErrorCode precondition_one_field(KSP ksp);
 
 /// The fixed-stress approximation of the Schur complement on the pressure,
-///   S = A_pp + sum over cells of c M / |M|,  c = (1' A_pu w)(w' A_up 1)/(w' A_uu w),
+///   S = A_pp + sum over cells of c M / |M|,  c = (1' A_pu w)(w' A_up 1)/s,
 /// with w a uniform dilation of the cell: the pressure's own block and the storage that the tissue's compliance gives
-/// (Kim, Tchelepi & Juanes 2011; White, Castelletto & Tchelepi 2016). Made of the element matrices alone, so it knows
-/// no tissue law.
+/// (Kim, Tchelepi & Juanes 2011; White, Castelletto & Tchelepi 2016). Tissue under a pressure that is the same all
+/// around moves against its bulk modulus, k = w' A_uu w; under a pressure that changes from cell to cell against the
+/// modulus of a plane wave, m = 3 sum over the axes of w_d' A_uu w_d (isotropic: k = 9 K, m = 9 (K + 4/3 G)).
+/// s is (3 k + 2 m)/5 and at least m/4: where a law is neutral k is nothing or less, but m is positive as long as the
+/// law is elliptic. Made of the element matrices alone, so it knows no tissue law.
 class FixedStress final : public CellMatrices {
 public:
   /// @p dm with fields displacement and pressure.
