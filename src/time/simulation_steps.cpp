@@ -18,10 +18,8 @@ namespace {
 /// A step cut below this share of the one asked for ends the run (-ts_adapt_dt_min may end it earlier).
 constexpr PetscReal least_step = 1e-5;
 
-/// So do as many accepted steps in a row below this share of the step asked for: the run only crawls towards a state
-/// that it cannot pass.
+/// So do some accepted steps in a row below this share of the step asked for (Simulation::max_crawling_steps).
 constexpr PetscReal crawling_step = 1e-3;
-constexpr int crawling_steps = 20;
 
 /// No load leaves a residual as small as this, but rounding does.
 constexpr PetscReal rounding = 1e-13;
@@ -51,6 +49,7 @@ PetscReal Simulation::next_step(PetscReal t, PetscReal h, TSAdapt adapt, PetscBo
   if (error && *error > 1 && growth * h > least) {
     accept = PETSC_FALSE;
     ++rejected_;
+    went("error in time");
     dt_ = growth * h;
     return landing(t);
   }
@@ -72,6 +71,11 @@ PetscErrorCode Simulation::before_stage(PetscReal t)
   PetscFunctionBeginUser;
   PetscCall(TSGetTime(ts_, &begin));
   PetscCall(TSGetTimeStep(ts_, &dt));
+  if (attempt_begins_) {
+    attempts_.emplace_back();
+    attempts_.back().begin = next_attempt();
+    attempt_begins_ = false;
+  }
   PetscCall(scheme_.begin_stage(t, dt));
   if (model_.memory()) {
     model_.memory()->settle();
@@ -97,12 +101,17 @@ PetscErrorCode Simulation::after_stage()
   PetscCall(SNESGetConvergedReason(snes, &reason));
   newton_ += newton;
   krylov_ += krylov;
+  PetscReal *norms;
+  PetscInt n_norms;
+  PetscCall(SNESGetConvergenceHistory(snes, &norms, nullptr, &n_norms));
+  attempts_.back().norms.insert(attempts_.back().norms.end(), norms, norms + n_norms);
   for (Partner *partner : partners_) {
     std::string why;
     PetscCall(partner->give_up(why));
     if (why.empty() || !unsolved_.empty()) continue;
     unsolved_ = why + ".";
     given_up_ = true;
+    went("given up");
   }
   if (!unsolved_.empty()) {
     PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
@@ -197,11 +206,43 @@ PetscErrorCode Simulation::ask_partners(const Attempt &attempt, PetscBool *accep
   *accept = PetscBool(verdict <= Verdict::kink);
   kink_ = verdict == Verdict::kink;
   if (verdict == Verdict::again) {
+    went("again, with the limit of the phase held");
     for (Partner *partner : partners_) partner->reject(verdict);
     PetscCall(keep_step(attempt.dt));
   }
   if (verdict == Verdict::shorter) PetscCall(reject(attempt.dt, why, 0, Measures(), false));
   PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+void Simulation::went(const std::string &outcome)
+{
+  attempts_.back().outcome = outcome;
+  attempt_begins_ = true;
+}
+
+AttemptBegin Simulation::next_attempt() const
+{
+  AttemptBegin begin;
+  (void)TSGetTimeStep(ts_, &begin.dt);
+  begin.wanted_dt = dt_;
+  begin.asked_dt = wanted_dt_;
+  begin.cut = cut_;
+  begin.always_new = lagging_.always_new();
+  begin.looks_back = scheme_.looks_back();
+  begin.limited = airway_.retakes();
+  begin.crawled = crawled_;
+  begin.failures = failures_;
+  return begin;
+}
+
+std::size_t Simulation::first_repeatable() const
+{
+  SNES snes;
+  (void)TSGetSNES(ts_, &snes);
+  if (crawls() || !lagging_.outlasts_steps(snes)) return 0;
+  const auto fresh =
+      std::find_if(attempts_.begin(), attempts_.end(), [](const AttemptRecord &a) { return a.begin.always_new; });
+  return fresh == attempts_.end() ? 0 : static_cast<std::size_t>(fresh - attempts_.begin());
 }
 
 /// Holds what the state in local_ leaves of its equations against what they balance. Fills rate_ and local_residual_.
@@ -237,6 +278,7 @@ PetscErrorCode Simulation::judge(PetscReal t, PetscReal volume, PetscReal pressu
                            errors, load, solved));
   std::ostringstream text;
   text << t;
+  if (!solved) went("not solved");
   if (!solved) PetscCall(end_unsolved("the step to t = " + text.str() + " s was not solved", balance_.complaint()));
   if (solved && balance_.warns())
     PetscCall(PetscPrintf(options_.comm(),
@@ -305,6 +347,7 @@ PetscErrorCode Simulation::fail(PetscReal dt, const std::string &reason, PetscIn
   PetscFunctionBeginUser;
   PetscCall(TSGetSNES(ts_, &snes));
   if (retry) PetscCall(lagging_.retry(snes, again));
+  went(reason);
   if (again) {
     for (Partner *partner : partners_) partner->reject(Verdict::again);
     PetscCall(keep_step(dt));
@@ -322,6 +365,7 @@ PetscErrorCode Simulation::reject(PetscReal dt, const std::string &reason, Petsc
   PetscFunctionBeginUser;
   if (failures_.size() == max_failures) failures_.erase(failures_.begin());
   failures_.push_back({accepted_.time, dt, reason, newton, measures, inverted});
+  went(reason);
   cut_ = true;
   ++rejected_;
   for (Partner *partner : partners_) partner->reject(Verdict::shorter);
@@ -351,9 +395,13 @@ PetscErrorCode Simulation::after_step()
   PetscCall(TSGetTimeStep(ts_, &next_dt_));
   row.dt = t - accepted_.time;
   cut_ = false;
+  accepted_attempts_ = std::move(attempts_);
+  attempts_.clear();
+  attempt_begins_ = true;
   const bool landed = same(t, phase_->end) || same(t, phase_->begin + phase_->ramp);
   crawled_ = row.dt < crawling_step * asked_dt() && !landed && !failures_.empty() ? crawled_ + 1 : 0;
   if (crawled_ == 0) failures_.clear();
+  if (crawls_soon()) lagging_.renew(snes); // who is to end for its steps does so with a new Jacobian
 
   // state and consistent flux of the accepted step
   PetscCall(airway_.apply(state_));
@@ -411,7 +459,7 @@ PetscErrorCode Simulation::after_step()
     PetscCall(TSGetTimeStep(ts_, &next_dt_));
   }
   PetscCall(report(row, measures));
-  if (crawled_ == crawling_steps) PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
+  if (crawls()) PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
   if (ends_early) PetscCall(TSSetConvergedReason(ts_, TS_CONVERGED_USER));
   if (!same(t, end_)) PetscCall(heed_request(TS_CONVERGED_USER));
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -478,7 +526,7 @@ FailureFacts Simulation::failure_facts() const
   FailureFacts facts;
   facts.attempts = failures_;
   facts.rows = rows_;
-  facts.crawled = crawled_ >= crawling_steps;
+  facts.crawled = crawls();
   facts.free_flow = airway_.mode() == Airway::Mode::free;
   facts.prescribes_pressure = phase_ && phase_->control == Control::pressure;
   if (phase_) facts.phase = phase_->name;
