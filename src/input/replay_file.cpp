@@ -59,19 +59,11 @@ std::string hash_of_file(const std::string &file)
 std::string ReplayFile::text() const
 {
   using Json = nlohmann::ordered_json;
-  Json json = {{"format", format},
-               {"version", version},
-               {"petsc", petsc},
-               {"ranks", ranks},
-               {"directory", directory},
-               {"mesh", mesh},
-               {"mesh_hash", mesh_hash},
-               {"environment", Json::object()},
-               {"failure", failure},
-               {"first_attempt", first},
-               {"warms_up", warms_up},
-               {"attempts", Json::array()},
-               {"options", Json::array()}};
+  Json json = {
+      {"format", format},        {"version", version},     {"petsc", petsc},         {"ranks", ranks},
+      {"directory", directory},  {"mesh", mesh},           {"mesh_hash", mesh_hash}, {"environment", Json::object()},
+      {"failure", failure},      {"first_attempt", first}, {"warms_up", warms_up},   {"attempts", Json::array()},
+      {"options", Json::array()}};
   for (const auto &[name, value] : environment) json["environment"][name] = value;
   for (const Attempt &a : attempts) {
     Json norms = Json::array();
@@ -93,8 +85,8 @@ std::string ReplayFile::read(const std::string &given, std::string &found)
   for (const fs::path &path : {fs::path(given), fs::path(given) / folder})
     if (found.empty() && fs::is_regular_file(path / file, error)) found = fs::absolute(path, error).string();
   if (found.empty())
-    return named + ": no " + file + " is there; give the directory of a run that failed in a step, which has a folder '" +
-           folder + "'";
+    return named + ": no " + file +
+           " is there; give the directory of a run that failed in a step, which has a folder '" + folder + "'";
   if (!fs::is_regular_file(fs::path(found) / state, error))
     return named + ": " + found + " is incomplete: " + state + " is missing; run the scene again";
   const std::string path = (fs::path(found) / file).string();

@@ -91,8 +91,8 @@ PetscErrorCode Replay::check()
   PetscCall(from_root(comm, complaint));
   PulmoUserCheck(complaint.empty(), comm, "%s", complaint.c_str());
   if (!note.empty())
-    PetscCall(PetscPrintf(comm, "pulmo: warning: -replay: %s are not set as for the run: numbers may round differently\n",
-                          note.c_str()));
+    PetscCall(PetscPrintf(
+        comm, "pulmo: warning: -replay: %s are not set as for the run: numbers may round differently\n", note.c_str()));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -141,8 +141,7 @@ PetscErrorCode Replay::make(bool &finished)
   simulation_.heed(first);
   PetscCall(simulation_.run(through));
   finished = through || simulation_.stopped();
-  const std::vector<AttemptRecord> &attempts =
-      finished ? simulation_.accepted_attempts() : simulation_.last_attempts();
+  const std::vector<AttemptRecord> &attempts = finished ? simulation_.accepted_attempts() : simulation_.last_attempts();
   for (std::size_t i = 0; i < attempts.size(); ++i) {
     bool same;
     const std::string line = compared(attempts[i], file_.first + i, same); // rank 0 has the file and prints
@@ -213,7 +212,8 @@ PetscErrorCode Replay::write(const std::string &failure, std::string &text)
     fs::create_directory(folder, error);
     int wrong = error.value();
     if (wrong == 0) wrong = write_image(folder + "/" + ReplayFile::state, image, true);
-    if (wrong == 0) wrong = write_whole(folder + "/" + ReplayFile::file, {json.begin(), json.end()}); // last: all is there
+    if (wrong == 0)
+      wrong = write_whole(folder + "/" + ReplayFile::file, {json.begin(), json.end()}); // last: all is there
     if (wrong != 0) complaint = std::strerror(wrong);
   }
   PetscCall(from_root(comm, complaint));

@@ -21,14 +21,14 @@ struct ReplayFile {
 
   std::string version, petsc;
   int ranks = 0;
-  std::string directory;                  ///< the working directory: options name files from there
-  std::string mesh, mesh_hash;            ///< the file, and hash_of_file() of it
-  NamedValues environment;    ///< what is set of variables that change rounding
-  std::vector<GivenOption> options;       ///< all, but those that only print
-  std::vector<Attempt> attempts;          ///< since the last accepted step
-  std::size_t first = 0;                  ///< attempt at which a replay begins
-  bool warms_up = false;                  ///< the solver keeps what it made of the first Jacobian of the run
-  std::string failure;                    ///< what the run said
+  std::string directory;            ///< the working directory: options name files from there
+  std::string mesh, mesh_hash;      ///< the file, and hash_of_file() of it
+  NamedValues environment;          ///< what is set of variables that change rounding
+  std::vector<GivenOption> options; ///< all, but those that only print
+  std::vector<Attempt> attempts;    ///< since the last accepted step
+  std::size_t first = 0;            ///< attempt at which a replay begins
+  bool warms_up = false;            ///< the solver keeps what it made of the first Jacobian of the run
+  std::string failure;              ///< what the run said
 
   static constexpr const char *folder = "replay", *file = "replay.json", *state = "state.h5";
 

@@ -7,8 +7,8 @@
 
 namespace pulmo {
 
-/// A run that could not go on leaves DIR/replay: the last good state, how its last attempts began and went, all options.
-/// A replay repeats these attempts, and nothing before them. Add it after the checkpoint.
+/// A run that could not go on leaves DIR/replay: the last good state, how its last attempts began and went, all
+/// options. A replay repeats these attempts, and nothing before them. Add it after the checkpoint.
 ///
 /// It ends in the same place bit for bit, on the same ranks, unless the solver keeps more of its past than Jacobians
 /// and factors; it says whether it did.
@@ -41,7 +41,7 @@ private:
   Simulation &simulation_;
   Checkpoint &checkpoint_;
   std::string folder_;
-  ReplayFile file_;              ///< on rank 0
+  ReplayFile file_;               ///< on rank 0
   std::vector<char> crawl_image_; ///< before the step that may be the last of a crawl, on rank 0
   bool has_image_ = false;
 };
