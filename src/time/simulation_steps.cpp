@@ -27,6 +27,9 @@ constexpr PetscReal rounding = 1e-13;
 /// Steps in which pressure spreads over so many cells' squares leave gas that is large beside what moves.
 constexpr PetscReal fast_gas = 1e4;
 
+/// A step that changed J by too much is cut to this share of itself at least, and at most.
+constexpr PetscReal least_J_cut = 0.1, largest_J_cut = 0.9;
+
 /// Failed attempts that are remembered.
 constexpr std::size_t max_failures = 12;
 
@@ -34,12 +37,16 @@ constexpr std::size_t max_failures = 12;
 
 PetscReal Simulation::next_step(PetscReal t, PetscReal h, TSAdapt adapt, PetscBool &accept)
 {
+  // the step after this one must not change J by too much either, if that goes on as it did
+  const PetscReal longest =
+      step_control_.J_change() > 0 ? h * step_control_.length_within_J_change(J_change_) : PETSC_MAX_REAL;
   accept = PETSC_TRUE;
   if (!step_control_.in_use()) {
     if (cut_)
       dt_ = h; // it took cuts to get here
     else if (h >= dt_ * (1 - same_time))
       dt_ = std::min(asked_dt(), adapt->clip[1] * dt_); // a full step: grow back
+    dt_ = std::min(dt_, longest);
     return landing(t + h);
   }
   const int order = scheme_.order();
@@ -55,6 +62,7 @@ PetscReal Simulation::next_step(PetscReal t, PetscReal h, TSAdapt adapt, PetscBo
   }
   // a step that was shortened to land says little of longer ones
   dt_ = std::min(adapt->dt_max, cut_ ? h : std::max(growth * h, h < dt_ && growth > 1 ? dt_ : 0));
+  dt_ = std::min(dt_, longest);
   return landing(t + h);
 }
 
@@ -173,6 +181,7 @@ PetscErrorCode Simulation::accept_stage(PetscReal t, Vec X, PetscBool *accept)
   PetscCall(airway_.pressure(local_, attempt.pressure));
   attempt.flow = airway_.opening_flow(scheme_.flow(measures.volume_change));
   PetscCall(ask_partners(attempt, accept));
+  if (*accept && step_control_.J_change() > 0) PetscCall(judge_J_change(dt, accept));
   if (!*accept) PetscFunctionReturn(PETSC_SUCCESS);
   bool solved;
   candidate_ = {t, measures.volume_change / units::mm3_per_ml, attempt.pressure / units::kPa_per_cmH2O};
@@ -211,6 +220,22 @@ PetscErrorCode Simulation::ask_partners(const Attempt &attempt, PetscBool *accep
     PetscCall(keep_step(attempt.dt));
   }
   if (verdict == Verdict::shorter) PetscCall(reject(attempt.dt, why, 0, Measures(), false));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Simulation::judge_J_change(PetscReal dt, PetscBool *accept)
+{
+  const PetscReal bound = step_control_.J_change();
+  std::ostringstream why;
+
+  PetscFunctionBeginUser;
+  PetscCall(model_.largest_J_change(before_, local_, J_change_));
+  if (J_change_ <= bound) PetscFunctionReturn(PETSC_SUCCESS);
+  *accept = PETSC_FALSE;
+  why << J_change_bound << ": |ln J| changed by " << J_change_ << ", " << bound << " at most";
+  const PetscReal share =
+      std::clamp<PetscReal>(step_control_.length_within_J_change(J_change_), least_J_cut, largest_J_cut);
+  PetscCall(reject(dt, why.str(), 0, Measures(), false, share));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -358,7 +383,7 @@ PetscErrorCode Simulation::fail(PetscReal dt, const std::string &reason, PetscIn
 }
 
 PetscErrorCode Simulation::reject(PetscReal dt, const std::string &reason, PetscInt newton, const Measures &measures,
-                                  bool inverted)
+                                  bool inverted, std::optional<PetscReal> share)
 {
   TSAdapt adapt;
 
@@ -371,7 +396,8 @@ PetscErrorCode Simulation::reject(PetscReal dt, const std::string &reason, Petsc
   for (Partner *partner : partners_) partner->reject(Verdict::shorter);
   PetscCall(TSRestartStep(ts_)); // BDF and -ts_theta_initial_guess_extrapolate must not look at a failed state
   PetscCall(TSGetAdapt(ts_, &adapt));
-  const PetscReal next = dt * adapt->scale_solve_failed;
+  const PetscReal next = dt * share.value_or(adapt->scale_solve_failed);
+  if (share) PetscCall(TSSetTimeStep(ts_, next / adapt->scale_solve_failed)); // PETSc cuts it
   if (next < std::max(adapt->dt_min, least_step * asked_dt()))
     PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
   PetscCall(heed_request(TS_DIVERGED_STEP_REJECTED));

@@ -14,6 +14,9 @@
 
 namespace pulmo {
 
+/// What the reason of an attempt begins with that changed J by too much.
+inline constexpr const char *J_change_bound = "-step_J_change";
+
 /// An attempt at a step that was not accepted.
 struct FailedAttempt {
   PetscReal time = 0, dt = 0; ///< where the step began and how long it was, s
@@ -25,14 +28,14 @@ struct FailedAttempt {
 
 /// What an attempt at a step hangs on, beside the state that it starts from.
 struct AttemptBegin {
-  PetscReal dt = 0;        ///< of the attempt, s
-  PetscReal wanted_dt = 0; ///< before any shortening to land on a time, s
-  PetscReal asked_dt = 0;  ///< -ts_dt, s
-  bool cut = false;        ///< the step was cut before
-  bool always_new = false; ///< no Jacobian is kept
-  bool looks_back = false; ///< the time scheme does, beyond the state before the step
-  bool limited = false;    ///< the attempt before it asked for this one with the limit of the phase held
-  int crawled = 0;         ///< accepted steps in a row before it that were tiny
+  PetscReal dt = 0;                    ///< of the attempt, s
+  PetscReal wanted_dt = 0;             ///< before any shortening to land on a time, s
+  PetscReal asked_dt = 0;              ///< -ts_dt, s
+  bool cut = false;                    ///< the step was cut before
+  bool always_new = false;             ///< no Jacobian is kept
+  bool looks_back = false;             ///< the time scheme does, beyond the state before the step
+  bool limited = false;                ///< the attempt before it asked for this one with the limit of the phase held
+  int crawled = 0;                     ///< accepted steps in a row before it that were tiny
   std::vector<FailedAttempt> failures; ///< that are remembered by then
 };
 

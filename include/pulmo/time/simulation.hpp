@@ -168,8 +168,11 @@ private:
   /// Step size asked for in the phase at hand (before the run: in its first), s.
   PetscReal asked_dt() const { return (phase_ ? *phase_ : phases_.front()).dt.value_or(wanted_dt_); }
   /// Notes an attempt that failed; ends the run if the next one would be too short.
+  /// @p share: the length of the next one over this one's, where something tells.
   PetscErrorCode reject(PetscReal dt, const std::string &reason, PetscInt newton, const Measures &measures,
-                        bool inverted);
+                        bool inverted, std::optional<PetscReal> share = {});
+  /// Holds the state in local_ against -step_J_change, and asks for a shorter step if it changes J by more.
+  PetscErrorCode judge_J_change(PetscReal dt, PetscBool *accept);
   PetscErrorCode report(SignalRow row, const Measures &measures);
   /// Lays out the phases again, those that ended early as long as they were.
   void lay_out_phases();
@@ -224,6 +227,7 @@ private:
   struct {
     Vec step = nullptr, product = nullptr;
   } bordered_;                  ///< a bordered step and the residual at its start, until the search along it begins
+  PetscReal J_change_ = 0;      ///< that the stage judged last makes, where -step_J_change bounds it
   PetscReal start_norm_ = 0;    ///< residual of the attempt at hand before any Newton step and guess
   int extra_newton_ = 0;        ///< Newton steps of the attempt at hand for the prescribed volume alone
   bool inverted_ = false;       ///< the attempt at hand met J <= 0, or no air
@@ -238,7 +242,7 @@ private:
   bool attempt_begins_ = true;                              ///< the next stage is the first of an attempt
   bool ended_in_step_ = false;
   const AttemptBegin *written_ = nullptr; ///< what persist() is to write the past of the scheme for
-  Diagnosis diagnosis_; ///< of a run that could not go on
+  Diagnosis diagnosis_;                   ///< of a run that could not go on
   StageSeconds seconds_;
 };
 
