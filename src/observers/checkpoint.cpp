@@ -23,14 +23,31 @@ namespace fs = std::filesystem;
 /// Options under these prefixes may change at a restart: the mesh and the programme are compared themselves, the rest
 /// does not change what is computed, but how.
 constexpr std::array<const char *, 15> free_prefixes{
-    "-mesh",    "-ventilator", "-predictor", "-newton",         "-step",  "-output",        "-progress",
-    "-effects", "-checkpoint", "-restart",   "-replay", "-error_estimate", "-scene", "-sensitivities", "-sweep"};
+    "-mesh",       "-ventilator", "-predictor", "-newton",         "-step",  "-output",        "-progress", "-effects",
+    "-checkpoint", "-restart",    "-replay",    "-error_estimate", "-scene", "-sensitivities", "-sweep"};
 /// Prefixes of options that change no number but rounding, and of what is compared by itself.
-constexpr std::array<const char *, 22> aside{
-    "-mesh",    "-ventilator",    "-output",  "-progress",     "-effects",           "-checkpoint",
-    "-restart", "-replay", "-ts_max_time",   "-options", "-dm_plex",      "-petscpartitioner",  "-log",
-    "-malloc",  "-info",          "-help",    "-skip_petscrc", "-no_signal_handler", "-error_estimate",
-    "-scene",   "-sensitivities", "-sweep"};
+constexpr std::array<const char *, 22> aside{"-mesh",
+                                             "-ventilator",
+                                             "-output",
+                                             "-progress",
+                                             "-effects",
+                                             "-checkpoint",
+                                             "-restart",
+                                             "-replay",
+                                             "-ts_max_time",
+                                             "-options",
+                                             "-dm_plex",
+                                             "-petscpartitioner",
+                                             "-log",
+                                             "-malloc",
+                                             "-info",
+                                             "-help",
+                                             "-skip_petscrc",
+                                             "-no_signal_handler",
+                                             "-error_estimate",
+                                             "-scene",
+                                             "-sensitivities",
+                                             "-sweep"};
 constexpr const char *flow_split = "-ventilator_flow_split"; // no part of the programme
 
 template <class List>
@@ -270,8 +287,8 @@ PetscErrorCode Checkpoint::persist_names(Archive &archive)
   PetscCall(archive.check(read_named_parts(text, there), "names"));
   const std::string differs = difference(there, here);
   PulmoUserCheck(differs.empty(), options_.comm(),
-                 "%s is a checkpoint of a mesh with other names: %s; give the mesh of that run",
-                 named_.c_str(), differs.c_str());
+                 "%s is a checkpoint of a mesh with other names: %s; give the mesh of that run", named_.c_str(),
+                 differs.c_str());
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
