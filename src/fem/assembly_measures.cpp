@@ -120,6 +120,28 @@ PetscErrorCode Assembly::measure(Vec x, Measures &measures) const
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode Assembly::largest_J_change(Vec x, Vec y, PetscReal &change) const
+{
+  PetscFunctionBeginUser;
+  change = 0;
+  {
+    const ReadArray xs(x), ys(y);
+    for (PetscInt c = 0; c < layout_.cells; ++c) {
+      const CellDisplacement u(watched_, &invJ_[9 * c], cell_dofs(c), xs.data());
+      const CellDisplacement v(watched_, &invJ_[9 * c], cell_dofs(c), ys.data());
+      for (std::size_t q = 0; q < rule_weights_.size(); ++q) {
+        PetscScalar H[9], G[9];
+        u.gradient(static_cast<PetscInt>(q), H);
+        v.gradient(static_cast<PetscInt>(q), G);
+        const PetscReal Jm1 = jacobian_minus_one(H);
+        change = std::max(change, std::abs(std::log1p((jacobian_minus_one(G) - Jm1) / (1 + Jm1))));
+      }
+    }
+  }
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &change, 1, MPIU_REAL, MPIU_MAX, PetscObjectComm((PetscObject)dm_)));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode Assembly::volume_derivative(Vec x, Vec y, PetscReal &derivative) const
 {
   PetscFunctionBeginUser;

@@ -3,6 +3,7 @@
 #include "pulmo/base/petsc.hpp"
 #include "pulmo/base/text_file.hpp"
 #include "pulmo/base/words.hpp"
+#include "pulmo/input/replay_file.hpp"
 
 #include <algorithm>
 #include <cstdlib>
@@ -135,6 +136,19 @@ public:
     return "";
   }
 
+  /// All options of a run that failed, as they were in force.
+  std::string replay(const std::string &directory)
+  {
+    ReplayFile file;
+    std::string folder;
+    const std::string fault = file.read(directory, folder);
+    if (!fault.empty()) return fault;
+    given_.list = file.options;
+    given_.list.push_back({"-replay", folder, "command line"});
+    given_.directory = file.directory;
+    return "";
+  }
+
   /// A file that is read if it is there.
   std::string petscrc(const std::string &file)
   {
@@ -181,6 +195,9 @@ private:
       return value ? file(name, *value, name == "-options_file_yaml") : name + " needs the name of a file";
     if (name == "-options_string_yaml")
       return value ? yaml(source, *value, "the value of " + name + " (" + source + ")") : name + " needs a value";
+    if (name == "-replay")
+      return "-replay " + (value ? *value : "DIR") + " (" + source +
+             ") must be the first word on the command line: what follows it replaces options of the run that failed";
     if (name == "-options_string")
       return "-options_string is no option of PETSc's; write the options themselves, or -options_string_yaml";
     if (name == "-prefix_push") {
@@ -312,6 +329,13 @@ GivenOptions read_options(const std::vector<std::string> &words, const Surroundi
   Reader reader(given);
   bool skip = false; // wherever it stands
 
+  if (!words.empty() && lower(words[0]) == "-replay") { // with what surrounded the run, not with what does now
+    given.fault = words.size() < 2 || is_name(words[1]) ? "-replay needs the directory of a run that failed"
+                                                        : reader.replay(words[1]);
+    if (given.fault.empty()) given.fault = reader.command_line({words.begin() + 2, words.end()});
+    if (given.fault.empty()) given.fault = reader.end();
+    return given;
+  }
   for (std::size_t i = 0; i < words.size(); ++i)
     if (lower(words[i]) == "-skip_petscrc")
       skip = i + 1 == words.size() || !is_one_of(lower(words[i + 1]), {"0", "false", "no", "off"});
@@ -337,6 +361,7 @@ std::string GivenOptions::packed() const
   const auto add = [&](const std::string &s) { text += s + '\0'; };
   add(fault);
   add(question);
+  add(directory);
   add(std::to_string(unasked.size()));
   for (const std::string &s : unasked) add(s);
   for (const GivenOption &o : list) {
@@ -359,6 +384,7 @@ GivenOptions GivenOptions::unpacked(const std::string &text)
   };
   given.fault = next();
   given.question = next();
+  given.directory = next();
   for (auto n = std::stoul(next()); n > 0; --n) given.unasked.push_back(next());
   while (at < text.size()) {
     GivenOption o;

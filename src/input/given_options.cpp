@@ -215,6 +215,14 @@ std::string Options::source(const std::string &name) const
   return found == sources_.rend() ? "" : found->second;
 }
 
+std::vector<std::string> Options::given_after(const std::string &name) const
+{
+  std::vector<std::string> names;
+  auto at = std::find_if(sources_.begin(), sources_.end(), [&](const auto &s) { return s.first == name; });
+  while (at != sources_.end() && ++at != sources_.end()) names.push_back(at->first);
+  return names;
+}
+
 OptionList Options::own_used() const
 {
   OptionList list;

@@ -22,15 +22,32 @@ namespace fs = std::filesystem;
 
 /// Options under these prefixes may change at a restart: the mesh and the programme are compared themselves, the rest
 /// does not change what is computed, but how.
-constexpr std::array<const char *, 14> free_prefixes{
-    "-mesh",    "-ventilator", "-predictor", "-newton",         "-step",  "-output",        "-progress",
-    "-effects", "-checkpoint", "-restart",   "-error_estimate", "-scene", "-sensitivities", "-sweep"};
+constexpr std::array<const char *, 15> free_prefixes{
+    "-mesh",       "-ventilator", "-predictor", "-newton",         "-step",  "-output",        "-progress", "-effects",
+    "-checkpoint", "-restart",    "-replay",    "-error_estimate", "-scene", "-sensitivities", "-sweep"};
 /// Prefixes of options that change no number but rounding, and of what is compared by itself.
-constexpr std::array<const char *, 21> aside{
-    "-mesh",    "-ventilator",    "-output",  "-progress",     "-effects",           "-checkpoint",
-    "-restart", "-ts_max_time",   "-options", "-dm_plex",      "-petscpartitioner",  "-log",
-    "-malloc",  "-info",          "-help",    "-skip_petscrc", "-no_signal_handler", "-error_estimate",
-    "-scene",   "-sensitivities", "-sweep"};
+constexpr std::array<const char *, 22> aside{"-mesh",
+                                             "-ventilator",
+                                             "-output",
+                                             "-progress",
+                                             "-effects",
+                                             "-checkpoint",
+                                             "-restart",
+                                             "-replay",
+                                             "-ts_max_time",
+                                             "-options",
+                                             "-dm_plex",
+                                             "-petscpartitioner",
+                                             "-log",
+                                             "-malloc",
+                                             "-info",
+                                             "-help",
+                                             "-skip_petscrc",
+                                             "-no_signal_handler",
+                                             "-error_estimate",
+                                             "-scene",
+                                             "-sensitivities",
+                                             "-sweep"};
 constexpr const char *flow_split = "-ventilator_flow_split"; // no part of the programme
 
 template <class List>
@@ -153,20 +170,13 @@ PetscErrorCode Checkpoint::write(std::string &complaint)
 {
   const MPI_Comm comm = options_.comm();
   const std::string part = path() + ".part";
-  std::unique_ptr<Archive> archive;
   std::vector<char> image;
   PetscMPIInt rank;
   int error = 0;
 
   PetscFunctionBeginUser;
   PetscCallMPI(MPI_Comm_rank(comm, &rank));
-  if (!order_.ready()) PetscCall(order_.setup(model_.dm()));
-  PetscCall(Archive::create(model_, order_, archive));
-  PetscCall(persist_scene(*archive));
-  PetscCall(simulation_.persist(*archive));
-  PetscCall(persist_numerics(*archive));
-  PetscCall(archive->finish(image));
-  archive.reset();
+  PetscCall(make(nullptr, image));
   if (rank == 0) {
     error = write_image(part, image, true);
     if (error == 0) error = take_place(part, path(), output_.path("checkpoint_previous.h5"), spare_previous_);
@@ -183,16 +193,59 @@ PetscErrorCode Checkpoint::write(std::string &complaint)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode Checkpoint::persist(Archive &archive, const AttemptBegin *begin)
+{
+  PetscFunctionBeginUser;
+  PetscCall(persist_scene(archive));
+  if (begin)
+    PetscCall(simulation_.persist_attempt(archive, *begin));
+  else
+    PetscCall(simulation_.persist(archive));
+  PetscCall(persist_numerics(archive));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Checkpoint::make(const AttemptBegin *begin, std::vector<char> &image)
+{
+  std::unique_ptr<Archive> archive;
+
+  PetscFunctionBeginUser;
+  if (!order_.ready()) PetscCall(order_.setup(model_.dm()));
+  PetscCall(Archive::create(model_, order_, archive));
+  PetscCall(persist(*archive, begin));
+  PetscCall(archive->finish(image));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Checkpoint::make_attempt(const AttemptBegin &begin, std::vector<char> &image)
+{
+  PetscFunctionBeginUser;
+  PetscCall(make(&begin, image));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Checkpoint::restore_attempt(const std::string &file)
+{
+  const AttemptBegin begin;
+  std::unique_ptr<Archive> archive;
+
+  PetscFunctionBeginUser;
+  named_ = "-replay " + file;
+  PetscCall(order_.setup(model_.dm()));
+  PetscCall(Archive::open(model_, order_, "-replay", file, archive));
+  PetscCall(persist(*archive, &begin));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode Checkpoint::restore()
 {
   std::unique_ptr<Archive> archive;
 
   PetscFunctionBeginUser;
+  named_ = "-restart " + restart_;
   PetscCall(order_.setup(model_.dm()));
   PetscCall(Archive::open(model_, order_, "-restart", restart_, archive));
-  PetscCall(persist_scene(*archive));
-  PetscCall(simulation_.persist(*archive));
-  PetscCall(persist_numerics(*archive));
+  PetscCall(persist(*archive, nullptr));
   schedule_->skip(simulation_.time());
   if (simulation_.end_cuts_next()) cut_from_ = simulation_.time(); // this file is the one to go on from, once more
   spare_previous_ = fs::path(restart_).filename() == "checkpoint_previous.h5";
@@ -209,9 +262,9 @@ PetscErrorCode Checkpoint::persist_scene(Archive &archive)
   PetscCall(archive.text("version", version));
   PetscCall(archive.text("mesh", mesh));
   PulmoUserCheck(mesh == order_.identity(), options_.comm(),
-                 "-restart %s is a checkpoint of another mesh (%s; this one: %s, coordinates in mm); give that run's "
+                 "%s is a checkpoint of another mesh (%s; this one: %s, coordinates in mm); give that run's "
                  "-dm_plex_filename and -mesh_scale",
-                 restart_.c_str(), mesh.c_str(), order_.identity().c_str());
+                 named_.c_str(), mesh.c_str(), order_.identity().c_str());
   PetscCall(persist_names(archive));
   OptionList own = options_.by_content(options_.own_used());
   own.erase(std::remove_if(own.begin(), own.end(), [](const auto &o) { return is_free(o.first); }), own.end());
@@ -234,8 +287,8 @@ PetscErrorCode Checkpoint::persist_names(Archive &archive)
   PetscCall(archive.check(read_named_parts(text, there), "names"));
   const std::string differs = difference(there, here);
   PulmoUserCheck(differs.empty(), options_.comm(),
-                 "-restart %s is a checkpoint of a mesh with other names: %s; give the mesh of that run",
-                 restart_.c_str(), differs.c_str());
+                 "%s is a checkpoint of a mesh with other names: %s; give the mesh of that run", named_.c_str(),
+                 differs.c_str());
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -248,9 +301,9 @@ PetscErrorCode Checkpoint::compare_options(const std::string &stored) const
     const auto text = [&](const auto &list) { return value_in(list, name).value_or("(not in use)"); };
     PetscFunctionBeginUser;
     PulmoUserError(options_.comm(),
-                   "-restart %s is a checkpoint of another scene: there %s is '%s', here '%s'; give the same effects "
+                   "%s is a checkpoint of another scene: there %s is '%s', here '%s'; give the same effects "
                    "and parameters (solver, output, -ts_max_time and phases that begin later may change)",
-                   restart_.c_str(), name.c_str(), text(then).c_str(), text(now).c_str());
+                   named_.c_str(), name.c_str(), text(then).c_str(), text(now).c_str());
   };
   for (const auto &[name, value] : then) {
     const auto here = value_in(now, name);
@@ -330,13 +383,13 @@ PetscErrorCode Checkpoint::compare_programme(const std::vector<Phase> &stored, P
   PetscFunctionBeginUser;
   if (scene_.facts().ventilator) now = scene_.facts().ventilator->phases();
   PulmoUserCheck(stored.empty() == now.empty(), options_.comm(),
-                 "-restart %s is a checkpoint of another scene: there -ventilator is %s, here %s; give that run's",
-                 restart_.c_str(), stored.empty() ? "off" : "in use", now.empty() ? "off" : "in use");
+                 "%s is a checkpoint of another scene: there -ventilator is %s, here %s; give that run's",
+                 named_.c_str(), stored.empty() ? "off" : "in use", now.empty() ? "off" : "in use");
   for (std::size_t i = 0; i < stored.size() && stored[i].begin < time; ++i)
     PulmoUserCheck(i < now.size() && same(stored[i], now[i]), options_.comm(),
-                   "-restart %s is a checkpoint of another scene: phase %zu of the ventilator (%s, %.6g to %.6g s), "
+                   "%s is a checkpoint of another scene: phase %zu of the ventilator (%s, %.6g to %.6g s), "
                    "which began before the checkpoint at %.6g s, was another; change only phases that begin later",
-                   restart_.c_str(), i + 1, stored[i].name.c_str(), (double)stored[i].begin, (double)stored[i].end,
+                   named_.c_str(), i + 1, stored[i].name.c_str(), (double)stored[i].begin, (double)stored[i].end,
                    (double)time);
   PetscFunctionReturn(PETSC_SUCCESS);
 }

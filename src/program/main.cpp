@@ -15,6 +15,7 @@
 #include <cstdlib>
 #include <exception>
 #include <string>
+#include <unistd.h>
 
 namespace {
 
@@ -175,6 +176,9 @@ int main(int argc, char **argv)
     MPI_Finalize();
     return given.question == "version" || given.question == "list" ? PULMO_FINISHED : PULMO_WRONG_INPUT;
   }
+  // options of a run that failed name files from where it ran; if that is gone the files are missed by name
+  if (!given.directory.empty() && chdir(given.directory.c_str()) != 0 && rank == 0)
+    std::printf("pulmo: note: -replay: the run worked in %s, which is not there any more\n", given.directory.c_str());
   pulmo::OptionList sources;
   PetscErrorCode code = hand_over(given, sources);
   if (code == 0) code = start_petsc(argv[0]);

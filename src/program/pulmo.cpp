@@ -8,6 +8,7 @@
 #include "pulmo/input/errors.hpp"
 #include "pulmo/observers/checkpoint.hpp"
 #include "pulmo/observers/ledger.hpp"
+#include "pulmo/observers/replay.hpp"
 #include "pulmo/physics/parameter_fields.hpp"
 #include "pulmo/program/dry_run.hpp"
 #include "pulmo/program/error_estimate.hpp"
@@ -240,6 +241,7 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   Sensitivities sensitivities;
   Recording recording;
   Checkpoint checkpoint(options, output, scene, run.model(), simulation);
+  Replay replay(options, output, simulation, checkpoint);
   SceneWords words;
   bool view_effects = false, view_scene = false, only_scene = false, audit_energy = true, asked_to_stop = false;
   PetscBool help, has_mesh;
@@ -250,6 +252,7 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   PetscCall(run.declare());
   PetscCall(output.declare(options));
   PetscCall(checkpoint.declare(options));
+  PetscCall(replay.declare(options));
   PetscCall(error_estimate.declare(options));
   PetscCall(dry_run.declare(options));
   PetscCall(sensitivities.declare(options));
@@ -266,10 +269,16 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   PetscCall(PetscOptionsHasHelp(nullptr, &help));
   PetscCall(PetscOptionsHasName(nullptr, nullptr, "-dm_plex_filename", &has_mesh));
   if (help) PetscCall(options.print_help());
+  if (replay.in_use() && !help) PetscCall(replay.check());
   if (!help || has_mesh) PetscCall(run.setup()); // with -help PETSc lists what it reads for this scene
   if (help) {
     if (has_mesh) PetscCall(options.print_settled());
     finished = true;
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+  if (replay.in_use()) {
+    PetscCall(replay.make(finished));
+    PulmoFailureCheck(finished, comm, "%s", simulation.failure_text().c_str());
     PetscFunctionReturn(PETSC_SUCCESS);
   }
   PetscCall(check_held(comm, scene, run.model().composition()));
@@ -338,6 +347,7 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   simulation.add(fields);
   if (output.progress()) simulation.add(progress);
   simulation.add(checkpoint);
+  simulation.add(replay);
   bool warned_of_elements = false;
   PetscCall(warn_of_equal_order(comm, scene, run.model(), simulation.wanted_dt(), warned_of_elements));
   const bool restarts = !checkpoint.restart().empty();
@@ -361,12 +371,14 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   if (view_effects) PetscCall(print_ledger(comm, scene, run.model(), simulation.seconds()));
   if (audit_energy) PetscCall(write_energy(comm, output, simulation, energy));
   if (!finished) {
-    std::string kept;
+    const std::string failure = simulation.failure_text();
+    std::string kept, repeats;
+    PetscCall(replay.write(failure, repeats));
     PetscCall(keep_last_state(checkpoint, simulation, kept));
     PetscCall(fields.snapshot(simulation.time(), simulation.local_state()));
     PetscCall(write_summary(options, output, scene, run.model(), simulation, audits, false));
-    PulmoFailure(comm, "%s The last good state and the signals so far are in %s.%s", simulation.failure_text().c_str(),
-                 output.directory().c_str(), kept.c_str());
+    PulmoFailure(comm, "%s The last good state and the signals so far are in %s.%s%s", failure.c_str(),
+                 output.directory().c_str(), kept.c_str(), repeats.c_str());
   }
   PetscCall(signals.finish());
   PetscCall(write_summary(options, output, scene, run.model(), simulation, audits, true));

@@ -37,7 +37,13 @@ PetscErrorCode Lagging::retry(SNES snes, bool &again)
 {
   PetscFunctionBeginUser;
   again = in_use() && !always_new_;
-  if (!again) PetscFunctionReturn(PETSC_SUCCESS);
+  if (again) PetscCall(stop_lagging(snes));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Lagging::stop_lagging(SNES snes)
+{
+  PetscFunctionBeginUser;
   always_new_ = true;
   PetscCall(SNESSetLagJacobian(snes, 1));
   PetscCall(SNESSetLagPreconditioner(snes, 1));
@@ -52,6 +58,16 @@ PetscErrorCode Lagging::settle(SNES snes)
   PetscCall(SNESSetLagJacobian(snes, jacobian_));
   PetscCall(SNESSetLagPreconditioner(snes, preconditioner_));
   PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+bool Lagging::outlasts_steps(SNES snes) const
+{
+  return (jacobian_ != 1 && snes->lagjac_persist) || (preconditioner_ != 1 && snes->lagpre_persist);
+}
+
+void Lagging::renew(SNES snes) const
+{
+  snes->jac_iter = snes->pre_iter = 0;
 }
 
 } // namespace pulmo

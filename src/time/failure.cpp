@@ -179,6 +179,12 @@ bool linear_solver_failed(const FailureFacts &facts)
   return !facts.attempts.empty() && facts.attempts.back().reason.find("LINEAR") != std::string::npos;
 }
 
+/// Whether the last attempt was solved, but changed J by more than a step may.
+bool bound_too_low(const FailureFacts &facts)
+{
+  return !facts.attempts.empty() && facts.attempts.back().reason.rfind(J_change_bound, 0) == 0;
+}
+
 /// What the diagnosis says, in a sentence that begins with a blank.
 std::string why(const Scene &scene, const FailureFacts &facts, const Diagnosis &d)
 {
@@ -213,7 +219,9 @@ std::string why(const Scene &scene, const FailureFacts &facts, const Diagnosis &
     break;
   case Diagnosis::Kind::solver:
     text << " Where: in the solver. "
-         << (linear_solver_failed(facts) ? "The linear solver failed" : "Newton's method stalled")
+         << (bound_too_low(facts)          ? "The bound of -step_J_change asks for shorter steps than there may be"
+             : linear_solver_failed(facts) ? "The linear solver failed"
+                                           : "Newton's method stalled")
          << " while no cell of the last step is near turning inside out (least J = " << facts.rows.back().min_J
          << ") and the law " << law << " is elliptic" << (d.lost_share > 0 ? " in the mean: " : ": ");
     stiffness();

@@ -192,6 +192,7 @@ PetscErrorCode Simulation::run(bool &finished)
     PetscCall(TSGetConvergedReason(ts_, &reason));
     if (reason < 0 || stopped_) {
       finished = false;
+      ended_in_step_ = reason < 0 && !stopped_;
       break;
     }
   }
@@ -211,6 +212,46 @@ PetscErrorCode Simulation::run(bool &finished)
   seconds_.total = end - begin + seconds_.setup;
   seconds_.solve = end - begin - seconds_.residual - seconds_.jacobian - seconds_.output;
   PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &seconds_, 6, MPI_DOUBLE, MPI_MAX, comm));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Simulation::warm_up()
+{
+  /// Stops as soon as a linear system was solved.
+  class FirstSystem final : public StopRequest {
+  public:
+    explicit FirstSystem(const Simulation &simulation) : simulation_(simulation) {}
+    PetscErrorCode asked(bool &stop) override
+    {
+      PetscFunctionBeginUser;
+      stop = simulation_.krylov_ > 0 || simulation_.accepted_.krylov > 0;
+      PetscFunctionReturn(PETSC_SUCCESS);
+    }
+
+  private:
+    const Simulation &simulation_;
+  };
+  FirstSystem first(*this);
+  SNES snes;
+  bool through;
+
+  PetscFunctionBeginUser;
+  heed(first);
+  PetscCall(run(through));
+  stop_request_ = nullptr;
+  PetscCall(TSGetSNES(ts_, &snes));
+  PetscCall(lagging_.settle(snes));
+  lagging_.renew(snes);
+  airway_.retake(false);
+  ended_.clear();
+  lay_out_phases();
+  rows_.clear();
+  attempts_.clear();
+  accepted_attempts_.clear();
+  attempt_begins_ = true;
+  unsolved_.clear();
+  newton_ = krylov_ = 0;
+  stopped_ = given_up_ = ended_in_step_ = inverted_ = false;
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -102,6 +102,54 @@ PetscErrorCode Simulation::persist_rows(Archive &archive)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode Simulation::persist_begin(Archive &archive, AttemptBegin &begin)
+{
+  std::string reasons;
+
+  PetscFunctionBeginUser;
+  PetscCall(archive.value("attempt/dt_s", begin.dt));
+  PetscCall(archive.value("attempt/dt_wanted_s", begin.wanted_dt));
+  PetscCall(archive.value("attempt/dt_asked_s", begin.asked_dt));
+  PetscCall(archive.value("attempt/cut", begin.cut));
+  PetscCall(archive.value("attempt/always_new", begin.always_new));
+  PetscCall(archive.value("attempt/looks_back", begin.looks_back));
+  PetscCall(archive.value("attempt/limited", begin.limited));
+  PetscCall(archive.value("attempt/crawled", begin.crawled));
+  PetscCall(archive.table("attempt_failures", begin.failures, FailedAttempt(), [](FailedAttempt &f, TableCells &cells) {
+    Measures &m = f.measures;
+    cells(f.time, f.dt, f.newton, f.inverted, m.min_J, m.min_air, m.airless_J, m.where[0], m.where[1], m.where[2],
+          m.cell, m.rank);
+  }));
+  for (const FailedAttempt &f : begin.failures) reasons += f.reason + "\n";
+  PetscCall(archive.text("attempt_reasons", reasons));
+  std::istringstream lines(reasons);
+  for (FailedAttempt &f : begin.failures) std::getline(lines, f.reason);
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Simulation::persist_attempt(Archive &archive, AttemptBegin begin)
+{
+  SNES snes;
+
+  PetscFunctionBeginUser;
+  PetscCall(persist_begin(archive, begin));
+  if (!archive.reading()) written_ = &begin;
+  PetscCall(persist(archive));
+  written_ = nullptr;
+  if (!archive.reading()) PetscFunctionReturn(PETSC_SUCCESS);
+  if (begin.asked_dt == wanted_dt_) { // else as persist() has it
+    dt_ = begin.wanted_dt;
+    next_dt_ = begin.dt;
+  }
+  cut_ = begin.cut;
+  crawled_ = begin.crawled;
+  failures_ = begin.failures;
+  airway_.retake(begin.limited);
+  PetscCall(TSGetSNES(ts_, &snes));
+  if (begin.always_new && lagging_.in_use()) PetscCall(lagging_.stop_lagging(snes));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode Simulation::persist(Archive &archive)
 {
   PetscInt index = phase_ ? static_cast<PetscInt>(phase_ - phases_.data()) : 0;
@@ -139,7 +187,8 @@ PetscErrorCode Simulation::persist(Archive &archive)
     PetscCall(airway_.restore(state_));
     PetscCall(check_state());
   }
-  PetscCall(scheme_.persist(archive, model_, moment(accepted_.time, accepted_.volume * units::mm3_per_ml, before_)));
+  PetscCall(scheme_.persist(archive, model_, moment(accepted_.time, accepted_.volume * units::mm3_per_ml, before_),
+                            written_ ? written_->looks_back : scheme_.looks_back()));
   if (model_.memory()) PetscCall(model_.memory()->persist(archive, scheme_.multistep()));
   PetscCall(step_control_.persist(archive));
   PetscCall(predictor_.persist(archive, state_));

@@ -180,6 +180,7 @@ PetscErrorCode Simulation::create_solver()
   PetscCall(compat::set_from_options(ts_));
   PetscCall(offer_fixed_stress(ksp));
   PetscCall(lagging_.setup(snes));
+  PetscCall(SNESSetConvergenceHistory(snes, nullptr, nullptr, PETSC_DECIDE, PETSC_TRUE));
   PetscBool tests_jacobian;
   PetscCall(PetscOptionsHasName(nullptr, nullptr, "-snes_test_jacobian", &tests_jacobian));
   tests_jacobian_ = tests_jacobian;

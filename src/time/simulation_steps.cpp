@@ -18,16 +18,17 @@ namespace {
 /// A step cut below this share of the one asked for ends the run (-ts_adapt_dt_min may end it earlier).
 constexpr PetscReal least_step = 1e-5;
 
-/// So do as many accepted steps in a row below this share of the step asked for: the run only crawls towards a state
-/// that it cannot pass.
+/// So do some accepted steps in a row below this share of the step asked for (Simulation::max_crawling_steps).
 constexpr PetscReal crawling_step = 1e-3;
-constexpr int crawling_steps = 20;
 
 /// No load leaves a residual as small as this, but rounding does.
 constexpr PetscReal rounding = 1e-13;
 
 /// Steps in which pressure spreads over so many cells' squares leave gas that is large beside what moves.
 constexpr PetscReal fast_gas = 1e4;
+
+/// A step that changed J by too much is cut to this share of itself at least, and at most.
+constexpr PetscReal least_J_cut = 0.1, largest_J_cut = 0.9;
 
 /// Failed attempts that are remembered.
 constexpr std::size_t max_failures = 12;
@@ -36,12 +37,16 @@ constexpr std::size_t max_failures = 12;
 
 PetscReal Simulation::next_step(PetscReal t, PetscReal h, TSAdapt adapt, PetscBool &accept)
 {
+  // the step after this one must not change J by too much either, if that goes on as it did
+  const PetscReal longest =
+      step_control_.J_change() > 0 ? h * step_control_.length_within_J_change(J_change_) : PETSC_MAX_REAL;
   accept = PETSC_TRUE;
   if (!step_control_.in_use()) {
     if (cut_)
       dt_ = h; // it took cuts to get here
     else if (h >= dt_ * (1 - same_time))
       dt_ = std::min(asked_dt(), adapt->clip[1] * dt_); // a full step: grow back
+    dt_ = std::min(dt_, longest);
     return landing(t + h);
   }
   const int order = scheme_.order();
@@ -51,11 +56,13 @@ PetscReal Simulation::next_step(PetscReal t, PetscReal h, TSAdapt adapt, PetscBo
   if (error && *error > 1 && growth * h > least) {
     accept = PETSC_FALSE;
     ++rejected_;
+    went("error in time");
     dt_ = growth * h;
     return landing(t);
   }
   // a step that was shortened to land says little of longer ones
   dt_ = std::min(adapt->dt_max, cut_ ? h : std::max(growth * h, h < dt_ && growth > 1 ? dt_ : 0));
+  dt_ = std::min(dt_, longest);
   return landing(t + h);
 }
 
@@ -72,6 +79,11 @@ PetscErrorCode Simulation::before_stage(PetscReal t)
   PetscFunctionBeginUser;
   PetscCall(TSGetTime(ts_, &begin));
   PetscCall(TSGetTimeStep(ts_, &dt));
+  if (attempt_begins_) {
+    attempts_.emplace_back();
+    attempts_.back().begin = next_attempt();
+    attempt_begins_ = false;
+  }
   PetscCall(scheme_.begin_stage(t, dt));
   if (model_.memory()) {
     model_.memory()->settle();
@@ -97,12 +109,17 @@ PetscErrorCode Simulation::after_stage()
   PetscCall(SNESGetConvergedReason(snes, &reason));
   newton_ += newton;
   krylov_ += krylov;
+  PetscReal *norms;
+  PetscInt n_norms;
+  PetscCall(SNESGetConvergenceHistory(snes, &norms, nullptr, &n_norms));
+  attempts_.back().norms.insert(attempts_.back().norms.end(), norms, norms + n_norms);
   for (Partner *partner : partners_) {
     std::string why;
     PetscCall(partner->give_up(why));
     if (why.empty() || !unsolved_.empty()) continue;
     unsolved_ = why + ".";
     given_up_ = true;
+    went("given up");
   }
   if (!unsolved_.empty()) {
     PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
@@ -164,6 +181,7 @@ PetscErrorCode Simulation::accept_stage(PetscReal t, Vec X, PetscBool *accept)
   PetscCall(airway_.pressure(local_, attempt.pressure));
   attempt.flow = airway_.opening_flow(scheme_.flow(measures.volume_change));
   PetscCall(ask_partners(attempt, accept));
+  if (*accept && step_control_.J_change() > 0) PetscCall(judge_J_change(dt, accept));
   if (!*accept) PetscFunctionReturn(PETSC_SUCCESS);
   bool solved;
   candidate_ = {t, measures.volume_change / units::mm3_per_ml, attempt.pressure / units::kPa_per_cmH2O};
@@ -197,11 +215,59 @@ PetscErrorCode Simulation::ask_partners(const Attempt &attempt, PetscBool *accep
   *accept = PetscBool(verdict <= Verdict::kink);
   kink_ = verdict == Verdict::kink;
   if (verdict == Verdict::again) {
+    went("again, with the limit of the phase held");
     for (Partner *partner : partners_) partner->reject(verdict);
     PetscCall(keep_step(attempt.dt));
   }
   if (verdict == Verdict::shorter) PetscCall(reject(attempt.dt, why, 0, Measures(), false));
   PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Simulation::judge_J_change(PetscReal dt, PetscBool *accept)
+{
+  const PetscReal bound = step_control_.J_change();
+  std::ostringstream why;
+
+  PetscFunctionBeginUser;
+  PetscCall(model_.largest_J_change(before_, local_, J_change_));
+  if (J_change_ <= bound) PetscFunctionReturn(PETSC_SUCCESS);
+  *accept = PETSC_FALSE;
+  why << J_change_bound << ": |ln J| changed by " << J_change_ << ", " << bound << " at most";
+  const PetscReal share =
+      std::clamp<PetscReal>(step_control_.length_within_J_change(J_change_), least_J_cut, largest_J_cut);
+  PetscCall(reject(dt, why.str(), 0, Measures(), false, share));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+void Simulation::went(const std::string &outcome)
+{
+  attempts_.back().outcome = outcome;
+  attempt_begins_ = true;
+}
+
+AttemptBegin Simulation::next_attempt() const
+{
+  AttemptBegin begin;
+  (void)TSGetTimeStep(ts_, &begin.dt);
+  begin.wanted_dt = dt_;
+  begin.asked_dt = wanted_dt_;
+  begin.cut = cut_;
+  begin.always_new = lagging_.always_new();
+  begin.looks_back = scheme_.looks_back();
+  begin.limited = airway_.retakes();
+  begin.crawled = crawled_;
+  begin.failures = failures_;
+  return begin;
+}
+
+std::size_t Simulation::first_repeatable() const
+{
+  SNES snes;
+  (void)TSGetSNES(ts_, &snes);
+  if (crawls() || !lagging_.outlasts_steps(snes)) return 0;
+  const auto fresh =
+      std::find_if(attempts_.begin(), attempts_.end(), [](const AttemptRecord &a) { return a.begin.always_new; });
+  return fresh == attempts_.end() ? 0 : static_cast<std::size_t>(fresh - attempts_.begin());
 }
 
 /// Holds what the state in local_ leaves of its equations against what they balance. Fills rate_ and local_residual_.
@@ -237,6 +303,7 @@ PetscErrorCode Simulation::judge(PetscReal t, PetscReal volume, PetscReal pressu
                            errors, load, solved));
   std::ostringstream text;
   text << t;
+  if (!solved) went("not solved");
   if (!solved) PetscCall(end_unsolved("the step to t = " + text.str() + " s was not solved", balance_.complaint()));
   if (solved && balance_.warns())
     PetscCall(PetscPrintf(options_.comm(),
@@ -305,6 +372,7 @@ PetscErrorCode Simulation::fail(PetscReal dt, const std::string &reason, PetscIn
   PetscFunctionBeginUser;
   PetscCall(TSGetSNES(ts_, &snes));
   if (retry) PetscCall(lagging_.retry(snes, again));
+  went(reason);
   if (again) {
     for (Partner *partner : partners_) partner->reject(Verdict::again);
     PetscCall(keep_step(dt));
@@ -315,19 +383,21 @@ PetscErrorCode Simulation::fail(PetscReal dt, const std::string &reason, PetscIn
 }
 
 PetscErrorCode Simulation::reject(PetscReal dt, const std::string &reason, PetscInt newton, const Measures &measures,
-                                  bool inverted)
+                                  bool inverted, std::optional<PetscReal> share)
 {
   TSAdapt adapt;
 
   PetscFunctionBeginUser;
   if (failures_.size() == max_failures) failures_.erase(failures_.begin());
   failures_.push_back({accepted_.time, dt, reason, newton, measures, inverted});
+  went(reason);
   cut_ = true;
   ++rejected_;
   for (Partner *partner : partners_) partner->reject(Verdict::shorter);
   PetscCall(TSRestartStep(ts_)); // BDF and -ts_theta_initial_guess_extrapolate must not look at a failed state
   PetscCall(TSGetAdapt(ts_, &adapt));
-  const PetscReal next = dt * adapt->scale_solve_failed;
+  const PetscReal next = dt * share.value_or(adapt->scale_solve_failed);
+  if (share) PetscCall(TSSetTimeStep(ts_, next / adapt->scale_solve_failed)); // PETSc cuts it
   if (next < std::max(adapt->dt_min, least_step * asked_dt()))
     PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
   PetscCall(heed_request(TS_DIVERGED_STEP_REJECTED));
@@ -351,9 +421,13 @@ PetscErrorCode Simulation::after_step()
   PetscCall(TSGetTimeStep(ts_, &next_dt_));
   row.dt = t - accepted_.time;
   cut_ = false;
+  accepted_attempts_ = std::move(attempts_);
+  attempts_.clear();
+  attempt_begins_ = true;
   const bool landed = same(t, phase_->end) || same(t, phase_->begin + phase_->ramp);
   crawled_ = row.dt < crawling_step * asked_dt() && !landed && !failures_.empty() ? crawled_ + 1 : 0;
   if (crawled_ == 0) failures_.clear();
+  if (crawls_soon()) lagging_.renew(snes); // who is to end for its steps does so with a new Jacobian
 
   // state and consistent flux of the accepted step
   PetscCall(airway_.apply(state_));
@@ -411,7 +485,7 @@ PetscErrorCode Simulation::after_step()
     PetscCall(TSGetTimeStep(ts_, &next_dt_));
   }
   PetscCall(report(row, measures));
-  if (crawled_ == crawling_steps) PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
+  if (crawls()) PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
   if (ends_early) PetscCall(TSSetConvergedReason(ts_, TS_CONVERGED_USER));
   if (!same(t, end_)) PetscCall(heed_request(TS_CONVERGED_USER));
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -478,7 +552,7 @@ FailureFacts Simulation::failure_facts() const
   FailureFacts facts;
   facts.attempts = failures_;
   facts.rows = rows_;
-  facts.crawled = crawled_ >= crawling_steps;
+  facts.crawled = crawls();
   facts.free_flow = airway_.mode() == Airway::Mode::free;
   facts.prescribes_pressure = phase_ && phase_->control == Control::pressure;
   if (phase_) facts.phase = phase_->name;

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 
 namespace pulmo {
 
@@ -27,6 +28,10 @@ PetscErrorCode StepControl::declare(Options &options)
   PetscCall(options.real("pressure_tolerance", "cmH2O", Range::not_negative(),
                          "error in the airway pressure that a step may make (0: the pressure does not choose steps)",
                          pressure_tolerance_));
+  PetscCall(options.real("J_change", "-", Range::not_negative(),
+                         "largest |ln(J / J before the step)| of any quadrature point in a step; one with more is cut, "
+                         "and those after it stay short enough (0: no bound)",
+                         J_change_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -65,6 +70,11 @@ std::optional<double> StepControl::error(int order, const Value &value, Free fre
   if (free.pressure && pressure_tolerance_ > 0)
     largest = std::max(largest, share(&Value::pressure, pressure_tolerance_));
   return largest;
+}
+
+double StepControl::length_within_J_change(double change) const
+{
+  return change > 0 ? safety * J_change_ / change : std::numeric_limits<double>::infinity();
 }
 
 double StepControl::growth(int order, double error)

@@ -71,9 +71,13 @@ PetscErrorCode TimeScheme::begin(Model &model, const Moment &start)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode TimeScheme::persist(Archive &archive, Model &model, const Moment &last)
+bool TimeScheme::looks_back() const
 {
-  bool looks_back = multistep_ && !ts_->steprestart;
+  return multistep_ && !ts_->steprestart;
+}
+
+PetscErrorCode TimeScheme::persist(Archive &archive, Model &model, const Moment &last, bool looks_back)
+{
   int there = order();
   Moment earlier{earlier_.time, earlier_.volume, nullptr, earlier_.scalars};
 

@@ -138,7 +138,8 @@ class Commands(unittest.TestCase):
         return os.path.join(cls.here, name)
 
     def test_pulmo(self):
-        found = of_all("build/pulmo")
+        # there is no failed run; replay_test has some
+        found = [(name, words) for name, words in of_all("build/pulmo") if "-replay" not in words]
         self.assertGreater(len(found), 20)
 
         def told(words):

@@ -93,6 +93,10 @@ public:
   void also_fill(CellMatrices &matrices) { also_ = &matrices; }
 
   PetscErrorCode measure(Vec x, Measures &measures) const { return assembly_.measure(x, measures); }
+  PetscErrorCode largest_J_change(Vec x, Vec y, PetscReal &change) const
+  {
+    return assembly_.largest_J_change(x, y, change);
+  }
   /// d(int (J - 1))/dx in direction @p y, mm^3 (local vectors).
   PetscErrorCode volume_derivative(Vec x, Vec y, PetscReal &derivative) const
   {

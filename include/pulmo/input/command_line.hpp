@@ -31,6 +31,7 @@ struct GivenOptions {
   std::string fault;                ///< what is wrong, in a sentence that tells how to fix it; empty: nothing
   std::vector<std::string> unasked; ///< sources that the command line does not name
   std::string question;             ///< "version", "list", or "usage" if nothing is given; empty: a run
+  std::string directory;            ///< working directory of the run that -replay repeats; empty: that of now
 
   /// As one string, to be sent to the other ranks, and back.
   std::string packed() const;

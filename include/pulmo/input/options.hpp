@@ -126,6 +126,8 @@ public:
   void came_from(const OptionList &sources) { sources_ = sources; }
   /// Where @p name came from: the command line, a file, the environment; empty if nothing tells.
   std::string source(const std::string &name) const;
+  /// Names that came after @p name, in their order.
+  std::vector<std::string> given_after(const std::string &name) const;
   /// Name and value of each option in the database.
   PetscErrorCode all_given(OptionList &list) const;
   /// Name and value of every option that the run used: pulmo's own of what is in use, defaults included, and PETSc's

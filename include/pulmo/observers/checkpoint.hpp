@@ -28,6 +28,11 @@ public:
   /// '0.1' until t = 0.2 s and '0.05' after it"; empty if none did, or the run began at rest.
   const std::string &numerics_changed() const { return numerics_changed_; }
 
+  /// What is to be known of attempt @p begin at the step after the last accepted one, as a file (on rank 0).
+  PetscErrorCode make_attempt(const AttemptBegin &begin, std::vector<char> &image);
+  /// Reads that from @p file, as restore() does.
+  PetscErrorCode restore_attempt(const std::string &file);
+
   PetscErrorCode observe(const StepReport &step) override;
   /// Writes a checkpoint after the last accepted step. @p complaint: why it could not, or empty; the older ones are
   /// then as they were.
@@ -35,6 +40,9 @@ public:
   std::string path() const { return output_.path("checkpoint.h5"); }
 
 private:
+  /// Writes or reads all of a file; before attempt @p begin, if there is one.
+  PetscErrorCode persist(Archive &archive, const AttemptBegin *begin);
+  PetscErrorCode make(const AttemptBegin *begin, std::vector<char> &image);
   /// Marks, scene and mesh: written, or read and compared.
   PetscErrorCode persist_scene(Archive &archive);
   /// Which facets and cells have which names.
@@ -53,6 +61,7 @@ private:
   NodeOrder order_;
   PetscReal every_ = 0;
   std::string restart_, numerics_changed_;
+  std::string named_; ///< the option that named the file that is read, and the file
   std::optional<Schedule> schedule_;
   std::optional<PetscReal> cut_from_; ///< the steps after this time are other ones because the run ends, s
   bool spare_previous_ = false;       ///< the run came from checkpoint_previous.h5: the one after it may be bad

@@ -22,6 +22,13 @@ public:
   PetscErrorCode retry(SNES snes, bool &again);
   /// A step was accepted.
   PetscErrorCode settle(SNES snes);
+  /// Whether a step may begin with a Jacobian or a preconditioner of an earlier one.
+  bool outlasts_steps(SNES snes) const;
+  /// The next solve begins with new ones.
+  void renew(SNES snes) const;
+  /// Whether nothing lags in the attempt at hand; and makes it so.
+  bool always_new() const { return always_new_; }
+  PetscErrorCode stop_lagging(SNES snes);
 
 private:
   PetscReal refresh_ = 0.1;

@@ -50,6 +50,9 @@ public:
   PetscErrorCode past(Past &past) override;
   /// Whether the step accepted last met what ends the phase early.
   bool phase_is_over() const { return over_; }
+  /// Whether the next attempt is to hold the limit of the phase, as the one before it asked; and makes it so.
+  bool retakes() const { return retake_; }
+  void retake(bool limited) { retake_ = limited; }
   /// After past() has read: takes the scalars, and puts those that have no node into a global vector.
   PetscErrorCode restore(Vec X);
 

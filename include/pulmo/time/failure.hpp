@@ -14,13 +14,36 @@
 
 namespace pulmo {
 
+/// What the reason of an attempt begins with that changed J by too much.
+inline constexpr const char *J_change_bound = "-step_J_change";
+
 /// An attempt at a step that was not accepted.
 struct FailedAttempt {
-  PetscReal time, dt; ///< where the step began and how long it was, s
+  PetscReal time = 0, dt = 0; ///< where the step began and how long it was, s
   std::string reason;
-  PetscInt newton;
-  Measures measures; ///< of the last state that kernels may not see, if any
-  bool inverted;     ///< there was one: J <= 0, or airless
+  PetscInt newton = 0;
+  Measures measures = {}; ///< of the last state that kernels may not see, if any
+  bool inverted = false;  ///< there was one: J <= 0, or airless
+};
+
+/// What an attempt at a step hangs on, beside the state that it starts from.
+struct AttemptBegin {
+  PetscReal dt = 0;                    ///< of the attempt, s
+  PetscReal wanted_dt = 0;             ///< before any shortening to land on a time, s
+  PetscReal asked_dt = 0;              ///< -ts_dt, s
+  bool cut = false;                    ///< the step was cut before
+  bool always_new = false;             ///< no Jacobian is kept
+  bool looks_back = false;             ///< the time scheme does, beyond the state before the step
+  bool limited = false;                ///< the attempt before it asked for this one with the limit of the phase held
+  int crawled = 0;                     ///< accepted steps in a row before it that were tiny
+  std::vector<FailedAttempt> failures; ///< that are remembered by then
+};
+
+/// An attempt, and how it went.
+struct AttemptRecord {
+  AttemptBegin begin;
+  std::vector<PetscReal> norms; ///< of the residual, in all of its Newton solves
+  std::string outcome = "accepted";
 };
 
 /// Refuses a model with cells whose tissue is not stable at rest; the message names the law's options. Collective.

@@ -44,6 +44,24 @@ public:
   void heed(StopRequest &request) { stop_request_ = &request; }
   /// Writes or reads the run after its last accepted step, observers included; after reading, run() goes on from there.
   PetscErrorCode persist(Archive &archive);
+  /// Starts the run, until its solver has made what it keeps to the end (orderings, coarse spaces) of the first
+  /// Jacobian, and forgets all else. persist_attempt() has to read next.
+  PetscErrorCode warm_up();
+  /// The same before attempt @p begin at the step after it, as it was when that began; after reading, run() repeats it.
+  PetscErrorCode persist_attempt(Archive &archive, AttemptBegin begin);
+  /// How the next attempt would begin.
+  AttemptBegin next_attempt() const;
+  /// Attempts at the step at which the run ended: those since the last accepted one, or at that one if steps crawled.
+  const std::vector<AttemptRecord> &last_attempts() const { return crawls() ? accepted_attempts_ : attempts_; }
+  /// Attempts at the last accepted step, that one included.
+  const std::vector<AttemptRecord> &accepted_attempts() const { return accepted_attempts_; }
+  /// The first of the last attempts that needs nothing of the solver's past.
+  std::size_t first_repeatable() const;
+  /// Whether a run that could not go on ended in a step, and not when it was judged as a whole.
+  bool ended_in_step() const { return ended_in_step_; }
+  /// Whether it ends as its steps only crawl, or does with one more such step.
+  bool crawls() const { return crawled_ >= max_crawling_steps; }
+  bool crawls_soon() const { return crawled_ == max_crawling_steps - 1; }
   /// Runs to the end. @p finished is false if the run was asked to stop, or if no step could be accepted any more;
   /// failure_text() then tells why.
   PetscErrorCode run(bool &finished);
@@ -99,7 +117,13 @@ public:
   PetscReal next_step(PetscReal t, PetscReal h, TSAdapt adapt, PetscBool &accept);
 
 private:
+  /// So many tiny steps in a row end a run: it only crawls towards a state that it cannot pass.
+  static constexpr int max_crawling_steps = 20;
+
   PetscErrorCode create_solver();
+  /// Notes how the attempt at hand went.
+  void went(const std::string &outcome);
+  PetscErrorCode persist_begin(Archive &archive, AttemptBegin &begin);
   FailureFacts failure_facts() const;
   /// The row at t = 0.
   PetscErrorCode start();
@@ -144,8 +168,11 @@ private:
   /// Step size asked for in the phase at hand (before the run: in its first), s.
   PetscReal asked_dt() const { return (phase_ ? *phase_ : phases_.front()).dt.value_or(wanted_dt_); }
   /// Notes an attempt that failed; ends the run if the next one would be too short.
+  /// @p share: the length of the next one over this one's, where something tells.
   PetscErrorCode reject(PetscReal dt, const std::string &reason, PetscInt newton, const Measures &measures,
-                        bool inverted);
+                        bool inverted, std::optional<PetscReal> share = {});
+  /// Holds the state in local_ against -step_J_change, and asks for a shorter step if it changes J by more.
+  PetscErrorCode judge_J_change(PetscReal dt, PetscBool *accept);
   PetscErrorCode report(SignalRow row, const Measures &measures);
   /// Lays out the phases again, those that ended early as long as they were.
   void lay_out_phases();
@@ -200,6 +227,7 @@ private:
   struct {
     Vec step = nullptr, product = nullptr;
   } bordered_;                  ///< a bordered step and the residual at its start, until the search along it begins
+  PetscReal J_change_ = 0;      ///< that the stage judged last makes, where -step_J_change bounds it
   PetscReal start_norm_ = 0;    ///< residual of the attempt at hand before any Newton step and guess
   int extra_newton_ = 0;        ///< Newton steps of the attempt at hand for the prescribed volume alone
   bool inverted_ = false;       ///< the attempt at hand met J <= 0, or no air
@@ -210,7 +238,11 @@ private:
   int crawled_ = 0;             ///< accepted steps in a row that were tiny
   Measures inverted_measures_;
   std::vector<FailedAttempt> failures_;
-  Diagnosis diagnosis_; ///< of a run that could not go on
+  std::vector<AttemptRecord> attempts_, accepted_attempts_; ///< at the step at hand; at the last accepted one
+  bool attempt_begins_ = true;                              ///< the next stage is the first of an attempt
+  bool ended_in_step_ = false;
+  const AttemptBegin *written_ = nullptr; ///< what persist() is to write the past of the scheme for
+  Diagnosis diagnosis_;                   ///< of a run that could not go on
   StageSeconds seconds_;
 };
 

@@ -23,11 +23,14 @@ public:
     bool volume = true, pressure = true;
   };
 
-  /// Declares -step_volume_tolerance and -step_pressure_tolerance.
+  /// Declares -step_volume_tolerance, -step_pressure_tolerance and -step_J_change.
   PetscErrorCode declare(Options &options);
   bool in_use() const { return volume_tolerance_ > 0 || pressure_tolerance_ > 0; }
   PetscReal volume_tolerance() const { return volume_tolerance_; }     ///< ml
   PetscReal pressure_tolerance() const { return pressure_tolerance_; } ///< cmH2O
+  PetscReal J_change() const { return J_change_; }                     ///< that a step may make, as |ln J|; 0: any
+  /// The length of a step that would change J by somewhat less than it may, over that of one that made @p change.
+  double length_within_J_change(double change) const;
   PetscErrorCode persist(Archive &archive);
 
   /// Forgets all before @p value: the time derivatives jump there.
@@ -42,7 +45,8 @@ public:
 
 private:
   PetscReal volume_tolerance_ = 0, pressure_tolerance_ = 0; ///< ml, cmH2O
-  std::vector<Value> past_;                                 ///< the last one first
+  PetscReal J_change_ = 0;
+  std::vector<Value> past_; ///< the last one first
 };
 
 } // namespace pulmo

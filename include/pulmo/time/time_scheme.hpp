@@ -36,8 +36,10 @@ public:
   int order() const { return multistep_ ? 2 : 1; }
 
   PetscErrorCode begin(Model &model, const Moment &start);
-  /// Writes or reads the past; @p last: of the last accepted step.
-  PetscErrorCode persist(Archive &archive, Model &model, const Moment &last);
+  /// Whether the step at hand looks back beyond the state before it.
+  bool looks_back() const;
+  /// Writes or reads the past; @p last: of the last accepted step. @p looks_back: what is written of that.
+  PetscErrorCode persist(Archive &archive, Model &model, const Moment &last, bool looks_back);
   /// Before the first step of a TSSolve: lets it look back on what was read, or on nothing.
   PetscErrorCode begin_solve(PetscInt steps);
   /// Begins a stage that ends at time @p t of a step of size @p dt, s.
