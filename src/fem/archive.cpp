@@ -15,7 +15,7 @@ namespace {
 constexpr const char *marker = "pulmo_checkpoint";
 // 2: the names of the mesh, the step sizes of phases; 3: what the solver left of its equations; 4: when the
 // breath at hand is to end
-constexpr int format = 4;
+constexpr int format = 5;
 
 /// @p data is resized to what is there; @p type as in memory.
 template <class T>

@@ -65,7 +65,12 @@ PetscErrorCode Predictor::persist(Archive &archive, Vec X)
     PetscCall(begin(X));
     known_ = std::min(known, increments_);
   }
-  for (PetscInt i = 0; i < known_; ++i) PetscCall(archive.global("increment_" + std::to_string(i + 1), increment_[i]));
+  for (PetscInt i = 0; i < known_; ++i) {
+    const std::string number = std::to_string(i + 1);
+    PetscCall(archive.global("increment_" + number, increment_[i]));
+    PetscCall(archive.value("predictor/slope_" + number, slope_[i]));
+    if (slope_[i] > 0) PetscCall(archive.global("residual_change_" + number, change_[i]));
+  }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

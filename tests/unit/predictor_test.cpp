@@ -53,10 +53,34 @@ protected:
   void TearDown() override { PULMO_OK(SNESDestroy(&snes_)); }
 
   static PetscReal direction(int step, PetscInt i) { return 0.1 * (step ? std::cos(0.7 * i) : std::sin(1. + i)); }
-  PetscErrorCode improve()
+  PetscErrorCode improve(PetscReal slope = 0)
   {
     return predictor_.improve(
-        snes_, [](Vec) { return PetscErrorCode(0); }, x_, norm_);
+        snes_, [](Vec) { return PetscErrorCode(0); }, slope, x_, norm_);
+  }
+  /// Solves the linear problem under @p load in place of the step that improve() began.
+  void solve(PetscReal load)
+  {
+    WriteArray x(x_);
+    for (PetscInt i = size; i-- > 0;) x[i] = (load - (i + 1 < size ? x[i + 1] : 0)) / (2 + i);
+  }
+  /// Steps under changing loads, each begun with @p slope; @p x: the guess of the last one. Returns its residuals.
+  PetscInt guess_after_steps(const std::vector<PetscReal> &slopes, std::vector<PetscReal> &x)
+  {
+    PetscInt before, after;
+    SetUp();
+    for (std::size_t step = 0; step < slopes.size(); ++step) {
+      problem_.load = 1 + 0.3 * static_cast<PetscReal>(step * step);
+      EXPECT_EQ(static_cast<int>(SNESGetNumberFunctionEvals(snes_, &before)), 0);
+      EXPECT_EQ(static_cast<int>(improve(slopes[step])), 0);
+      EXPECT_EQ(static_cast<int>(SNESGetNumberFunctionEvals(snes_, &after)), 0);
+      if (step + 1 == slopes.size()) break;
+      solve(problem_.load);
+      EXPECT_EQ(static_cast<int>(predictor_.accept(x_)), 0);
+    }
+    const ReadArray guess(x_);
+    x.assign(guess.data(), guess.data() + size);
+    return after - before;
   }
   PetscReal residual_norm()
   {
@@ -86,6 +110,19 @@ TEST_F(PredictorTest, MinimisesTheResidualOverPastIncrements)
     for (PetscInt i = 0; i < size; ++i)
       dot += f[i] * ((2 + i) * direction(step, i) + (i + 1 < size ? direction(step, i + 1) : 0));
     EXPECT_NEAR(dot, 0, 1e-12) << "increment " << step;
+  }
+}
+
+TEST_F(PredictorTest, StepsOfTheSameLengthLeaveTheirSecantsBehind)
+{
+  std::vector<PetscReal> evaluated, left, longer;
+  // without slopes: the residual at the start, of two secants, of the guess
+  EXPECT_EQ(guess_after_steps({0, 0, 0}, evaluated), 4);
+  EXPECT_EQ(guess_after_steps({20, 20, 20}, left), 2);
+  EXPECT_EQ(guess_after_steps({20, 20, 10}, longer), 4) << "secants of steps of another length are of no use";
+  for (std::size_t i = 0; i < evaluated.size(); ++i) {
+    EXPECT_NEAR(left[i], evaluated[i], 1e-12); // a linear problem has the same secants everywhere
+    EXPECT_NEAR(longer[i], evaluated[i], 1e-12);
   }
 }
 

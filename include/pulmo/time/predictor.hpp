@@ -22,7 +22,7 @@ public:
 
   /// Begins a run at state @p X.
   PetscErrorCode begin(Vec X);
-  /// Writes or reads the increments that led to state @p X; reads as many as are in use.
+  /// Writes or reads the increments that led to state @p X and their secants; reads as many as are in use.
   PetscErrorCode persist(Archive &archive, Vec X);
   /// Takes note of an accepted state.
   PetscErrorCode accept(Vec X);
