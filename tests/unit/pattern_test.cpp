@@ -133,5 +133,83 @@ TEST(Pattern, OtherMatrixTypesAreLeftToPetsc)
   expect_stock_pattern(run.model().dm(), A);
 }
 
+/// The matrix of a whole scene, with random entries.
+PetscErrorCode random_matrix(SceneRun &run, bool airflow, const char *mesh, Mat *A)
+{
+  PetscFunctionBeginUser;
+  PetscCall(
+      prepare(run, full_scene(airflow).options() + " -dm_plex_filename " + source(std::string("meshes/") + mesh)));
+  PetscCall(run.model().create_matrix(A));
+  PetscCall(MatSetRandom(*A, nullptr));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+TEST(Matrix, ProductIsTheSumOverItsRows)
+{
+  for (const bool airflow : {false, true})
+    for (const char *mesh : {"cube_coarse.msh", "cube.msh"}) {
+      SCOPED_TRACE(mesh);
+      const Registry registry = Registry::standard();
+      SceneRun run(registry);
+      MatHandle A;
+      VecHandle x, y, everywhere;
+      VecScatter to_all;
+      PetscInt begin, end;
+      PULMO_OK(random_matrix(run, airflow, mesh, A.out()));
+      PULMO_OK(random_direction(run, x));
+      PULMO_OK(VecDuplicate(x, y.out()));
+      PULMO_OK(MatMult(A, x, y));
+      PULMO_OK(VecScatterCreateToAll(x, &to_all, everywhere.out()));
+      PULMO_OK(VecScatterBegin(to_all, x, everywhere, INSERT_VALUES, SCATTER_FORWARD));
+      PULMO_OK(VecScatterEnd(to_all, x, everywhere, INSERT_VALUES, SCATTER_FORWARD));
+      PULMO_OK(VecScatterDestroy(&to_all));
+      PULMO_OK(MatGetOwnershipRange(A, &begin, &end));
+      const ReadArray xs(everywhere), ys(y);
+      for (PetscInt row = begin; row < end; ++row) {
+        PetscInt n;
+        const PetscInt *column;
+        const PetscScalar *entry;
+        PetscScalar sum = 0, size = 1e-300;
+        PULMO_OK(MatGetRow(A, row, &n, &column, &entry));
+        for (PetscInt k = 0; k < n; ++k) {
+          sum += entry[k] * xs[column[k]];
+          size += std::abs(entry[k] * xs[column[k]]);
+        }
+        PULMO_OK(MatRestoreRow(A, row, &n, &column, &entry));
+        ASSERT_LT(std::abs(ys[row - begin] - sum) / size, 1e-14) << "row " << row;
+      }
+    }
+}
+
+TEST(Matrix, BlocksOfFieldsAreRenewedAsTheyWereMade)
+{
+  const Registry registry = Registry::standard();
+  SceneRun run(registry);
+  MatHandle A;
+  PetscInt n;
+  IS *fields;
+  PULMO_OK(random_matrix(run, true, "cube.msh", A.out()));
+  PULMO_OK(DMCreateFieldIS(run.model().dm(), &n, nullptr, &fields));
+  ASSERT_EQ(n, 2);
+  for (int i = 0; i < 2; ++i)
+    for (int j = 0; j < 2; ++j) {
+      MatHandle kept, fresh;
+      Mat block;
+      PetscBool same;
+      PetscReal change;
+      PULMO_OK(MatCreateSubMatrix(A, fields[i], fields[j], MAT_INITIAL_MATRIX, kept.out()));
+      PULMO_OK(MatNorm(kept, NORM_FROBENIUS, &change));
+      PULMO_OK(MatScale(A, -2));
+      block = kept;
+      PULMO_OK(MatCreateSubMatrix(A, fields[i], fields[j], MAT_REUSE_MATRIX, &block));
+      PULMO_OK(MatCreateSubMatrix(A, fields[i], fields[j], MAT_INITIAL_MATRIX, fresh.out()));
+      PULMO_OK(MatEqual(block, fresh, &same));
+      EXPECT_TRUE(same) << "block " << i << ", " << j;
+      EXPECT_GT(change, 0);
+    }
+  for (PetscInt i = 0; i < n; ++i) PULMO_OK(ISDestroy(&fields[i]));
+  PULMO_OK(PetscFree(fields));
+}
+
 } // namespace
 } // namespace pulmo::test
