@@ -84,8 +84,9 @@ PetscErrorCode Replay::check()
                   ", this one has " + std::to_string(size) +
                   ": sums round differently; give as many, or go on from the run's checkpoint.h5 with -restart";
     else if (mesh != file_.mesh_hash)
-      complaint = named + ": the mesh file " + file_.mesh + (mesh.empty() ? " cannot be read" : " has changed") +
-                  " since the run; put that of the run in its place";
+      complaint = named + ": the mesh file " + file_.mesh +
+                  (mesh.empty() ? " cannot be read" : " has changed since the run") +
+                  "; put that of the run in its place";
     if (rounding_environment() != file_.environment) note = "OMP_NUM_THREADS, OPENBLAS_NUM_THREADS and the like";
   }
   PetscCall(from_root(comm, complaint));
