@@ -16,8 +16,8 @@ typedef float FloatVector __attribute__((vector_size(16), aligned(4), may_alias)
 constexpr PetscInt block_size = 9;  ///< floats of a block, stored by columns
 constexpr PetscInt vector_size = 4; ///< floats of a node's vector, the last one without meaning
 
-/// The scattered reads of a vector keep the machine from seeing that blocks lie one behind the other: they are asked for
-/// so many floats ahead.
+/// The scattered reads of a vector keep the machine from seeing that blocks lie one behind the other: they are asked
+/// for so many floats ahead.
 constexpr PetscInt ahead = 2048;
 
 using NodeVectors = std::vector<float>; ///< [node][vector_size]
