@@ -21,11 +21,15 @@ void expect_free_inflation(const TissueLaw &law, const std::string &mesh, const 
   const Registry registry = Registry::standard();
   SceneRun run(registry);
   bool finished = false;
+  const bool no_shear = std::string(law.name()) == "rausch";
 
-  PULMO_OK(prepare(run, "-options_file " + source("petsc_options/solvers/tight.opts") + " -dm_plex_filename " +
-                            source(mesh) + " -mesh_scale 1 -tissue " + law.name() +
-                            " -ventilator pcv -ventilator_pip 6 -lumen_pressure off -ventilator_settle off " +
-                            (rollers_hold ? rollers : "-support -support_rigid ") + options));
+  PULMO_OK(
+      prepare(run, "-options_file " + source("petsc_options/solvers/tight.opts") + " -dm_plex_filename " +
+                       source(mesh) + " -mesh_scale 1 -tissue " + law.name() +
+                       " -ventilator pcv -ventilator_pip 6 -lumen_pressure off -ventilator_settle off " +
+                       (rollers_hold ? rollers : "-support -support_rigid ") + options +
+                       // where Newton's method wanders along shears that meet no stiffness, rounding leaves 1.3e-12
+                       (no_shear ? " -snes_atol 2e-12" : "")));
   PULMO_OK(run.simulation().run(finished));
   ASSERT_TRUE(finished) << run.simulation().failure_text();
   EXPECT_EQ(run.simulation().rejected_steps(), 0);
@@ -52,8 +56,8 @@ void expect_free_inflation(const TissueLaw &law, const std::string &mesh, const 
   }));
   EXPECT_LT(worst_J, 1e-9);
   // CM5 has no shear stiffness at all in pure dilatation: stress grows with the cube of a shear strain, so that a
-  // residual of 1e-12 leaves strains of (1e-12)^1/3
-  const double tolerance = std::string(law.name()) == "rausch" ? 1e-4 : 1e-9;
+  // residual of 2e-12 leaves strains of some (2e-12)^1/3
+  const double tolerance = no_shear ? 1e-4 : 1e-9;
   EXPECT_LT(worst_C, tolerance);
   if (rollers_hold) {
     EXPECT_LT(worst_F, tolerance);
