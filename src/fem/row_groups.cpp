@@ -110,11 +110,20 @@ PetscErrorCode multiply(Mat A, Vec x, Vec y)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+#if PETSC_VERSION_LT(3, 23, 0)
 PetscErrorCode destroy(void *groups)
 {
   delete static_cast<RowGroups *>(groups);
   return PETSC_SUCCESS;
 }
+#else
+PetscErrorCode destroy(void **groups)
+{
+  delete static_cast<RowGroups *>(*groups);
+  return PETSC_SUCCESS;
+}
+#define PetscContainerSetUserDestroy PetscContainerSetCtxDestroy
+#endif
 
 } // namespace
 
