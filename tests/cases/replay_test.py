@@ -105,6 +105,18 @@ class Replay(unittest.TestCase):
         good = pulmo.finished(SOLVER + ["-snes_max_it", "30", "-ts_max_time", "0.05", "-output_overwrite"], directory=case.directory)
         self.assertNotIn("replay", good.files())
 
+    def test_a_file_of_that_name_stays(self):
+        directory = pulmo.scratch()
+        os.mkdir(directory)
+        mine = os.path.join(directory, "replay")
+        with open(mine, "w") as f:
+            f.write("mine")
+        case = pulmo.Case(SOLVER, directory=directory)
+        self.assertEqual(case.code, 2, case.tail())
+        self.assertIn("No folder for -replay (", case.err)
+        with open(mine) as f:
+            self.assertEqual(f.read(), "mine")
+
     def test_what_is_refused(self):
         mesh = pulmo.scratch("mesh.msh")
         shutil.copy(pulmo.mesh("cube_lung.msh"), mesh)
