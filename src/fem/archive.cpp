@@ -55,8 +55,17 @@ bool read_text(hid_t file, const std::string &name, std::string &text)
   return true;
 }
 
-/// Opens a file for reading. @p complaint: what is wrong with it and how to fix it.
-hid_t open_file(const std::string &name, std::string &complaint)
+/// What to do about a file that cannot be used, which @p option named.
+std::string instead(const std::string &option, const char *otherwise)
+{
+  return option == "-replay" ? "run the scene again" : otherwise;
+}
+
+constexpr const char *take_another = "take another checkpoint (checkpoint_previous.h5)";
+constexpr const char *give_one = "give a checkpoint.h5 that pulmo wrote";
+
+/// Opens a file for reading, which @p option named. @p complaint: what is wrong with it and how to fix it.
+hid_t open_file(const std::string &option, const std::string &name, std::string &complaint)
 {
   std::error_code error;
   int found = -1;
@@ -72,18 +81,18 @@ hid_t open_file(const std::string &name, std::string &complaint)
   }
   std::fclose(f);
   if (H5Fis_hdf5(name.c_str()) <= 0) {
-    complaint = "this is no HDF5 file; give a checkpoint.h5 that pulmo wrote";
+    complaint = "this is no HDF5 file; " + instead(option, give_one);
     return -1;
   }
   hid_t file = H5Fopen(name.c_str(), H5F_ACC_RDONLY, H5P_DEFAULT);
   if (file < 0) {
-    complaint = "the file is truncated or damaged; take another checkpoint (checkpoint_previous.h5)";
+    complaint = "the file is truncated or damaged; " + instead(option, take_another);
     return -1;
   }
   {
     const Hdf5Id mark(H5Aopen(file, marker, H5P_DEFAULT), H5Aclose);
     if (mark < 0)
-      complaint = "this HDF5 file is no checkpoint of pulmo; give a checkpoint.h5 that pulmo wrote";
+      complaint = "this HDF5 file is no checkpoint of pulmo; " + instead(option, give_one);
     else if (H5Aread(mark, H5T_NATIVE_INT, &found) < 0 || found != format)
       complaint = "the checkpoint has format " + std::to_string(found) + ", this pulmo reads format " +
                   std::to_string(format) + "; go on with the pulmo that wrote it";
@@ -137,7 +146,7 @@ PetscErrorCode Archive::open(const Model &model, const NodeOrder &order, const s
   archive->path_ = file;
   if (archive->root_) {
     const QuietHdf5 quiet;
-    archive->file_ = open_file(file, complaint);
+    archive->file_ = open_file(option, file, complaint);
   }
   PetscCall(from_root(archive->comm_, complaint));
   PulmoUserCheck(complaint.empty(), archive->comm_, "%s %s: %s", option.c_str(), file.c_str(), complaint.c_str());
@@ -173,9 +182,8 @@ PetscErrorCode Archive::finish(std::vector<char> &image)
 PetscErrorCode Archive::check(bool good, const std::string &name) const
 {
   PetscFunctionBeginUser;
-  PulmoUserCheck(good, comm_,
-                 "%s %s: '%s' is damaged or missing in the file; take another checkpoint (checkpoint_previous.h5)",
-                 option_.c_str(), path_.c_str(), name.c_str());
+  PulmoUserCheck(good, comm_, "%s %s: '%s' is damaged or missing in the file; %s", option_.c_str(), path_.c_str(),
+                 name.c_str(), instead(option_, take_another).c_str());
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

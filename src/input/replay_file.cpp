@@ -2,7 +2,9 @@
 
 #include <nlohmann/json.hpp>
 
+#include <algorithm>
 #include <array>
+#include <cctype>
 #include <cstdint>
 #include <cstdio>
 #include <cstdlib>
@@ -121,7 +123,12 @@ std::string ReplayFile::read(const std::string &given, std::string &found)
   } catch (const nlohmann::json::exception &) {
     return named + ": " + path + damaged;
   }
-  return first < attempts.size() ? "" : named + ": " + path + damaged;
+  const auto no_option = [](const GivenOption &o) {
+    return o.name.size() < 2 || o.name[0] != '-' || std::isalpha(static_cast<unsigned char>(o.name[1])) == 0;
+  };
+  const bool good = ranks > 0 && !mesh.empty() && first < attempts.size() && !options.empty() &&
+                    std::none_of(options.begin(), options.end(), no_option);
+  return good ? "" : named + ": " + path + damaged;
 }
 
 } // namespace pulmo

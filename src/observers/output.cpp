@@ -127,7 +127,8 @@ PetscErrorCode Output::prepare(const Options &options, const std::string &restar
       const bool keep = continues && std::find(kept.begin(), kept.end(), name) != kept.end();
       if (name.rfind("fields", 0) == 0 && entry.path().extension() == ".h5" && !keep) old.push_back(entry.path());
     }
-    for (const char *name : {"replay/replay.json", "replay/state.h5", "replay"}) old.push_back(path(name));
+    if (fs::is_directory(path("replay"), error)) // no file of the user's
+      for (const char *name : {"replay/replay.json", "replay/state.h5", "replay"}) old.push_back(path(name));
     for (const fs::path &file : old) fs::remove(file, error);
   }
   PetscCallMPI(MPI_Barrier(comm));

@@ -66,6 +66,11 @@ PetscErrorCode Replay::check()
   std::string complaint, note;
 
   PetscFunctionBeginUser;
+  for (const std::string &name : options_.given_after("-replay"))
+    for (const char *other : {"-restart", "-dry_run", "-scene_view_only"})
+      PulmoUserCheck(
+          name != other, comm,
+          "%s does not go with -replay, which repeats the end of a run from its last good state; leave one out", other);
   PetscCallMPI(MPI_Comm_rank(comm, &rank));
   PetscCallMPI(MPI_Comm_size(comm, &size));
   if (rank == 0) {
@@ -129,12 +134,14 @@ PetscErrorCode Replay::make(bool &finished)
   const std::vector<std::string> more = options_.given_after("-replay");
   bool through, all_same = true;
   std::ostringstream told;
+  PetscReal begin;
 
   PetscFunctionBeginUser;
   bool warms_up = file_.warms_up;
   PetscCall(from_root(comm, warms_up));
   if (warms_up) PetscCall(simulation_.warm_up());
   PetscCall(checkpoint_.restore_attempt((fs::path(folder_) / ReplayFile::state).string()));
+  begin = simulation_.time();
   for (const std::string &name : more) told << (told.str().empty() ? ", with other options: " : ", ") << name;
   PetscCall(PetscPrintf(comm, "replay of %s from t = %.6g s%s\n", folder_.c_str(), (double)simulation_.time(),
                         told.str().c_str()));
@@ -156,10 +163,9 @@ PetscErrorCode Replay::make(bool &finished)
                           "pulmo: warning: -replay: these attempts are not those of the run, bit for bit: its solver "
                           "keeps more of its past than a replay knows of, or the machine is another\n"));
   if (finished)
-    PetscCall(PetscPrintf(comm,
-                          "the step to t = %.6g s was accepted: to go on, give the run's options, these ones, and "
-                          "-restart with its checkpoint.h5\n",
-                          (double)simulation_.time()));
+    PetscCall(PetscPrintf(comm, "the step to t = %.6g s was accepted: to go on, give the run's options, these ones%s\n",
+                          (double)simulation_.time(),
+                          begin > 0 ? ", and -restart with its checkpoint.h5" : "; it has to begin anew"));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

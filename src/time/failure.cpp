@@ -230,7 +230,7 @@ std::string why(const Scene &scene, const FailureFacts &facts, const Diagnosis &
   return text.str() + d.limit;
 }
 
-std::string what_to_try(const Scene &scene, const Diagnosis &d)
+std::string what_to_try(const Scene &scene, const FailureFacts &facts, const Diagnosis &d)
 {
   bool wall = false; // the gas presses on it
   for (const Effect *effect : scene.active()) wall = wall || effect->name() == std::string("lumen_pressure");
@@ -246,6 +246,8 @@ std::string what_to_try(const Scene &scene, const Diagnosis &d)
   case Diagnosis::Kind::solver:
     break;
   }
+  if (bound_too_low(facts))
+    return "a larger -step_J_change, a smaller -ts_adapt_dt_min, a slower rise or fall of pressure or flow.";
   return std::string(scene.facts().surface_pressures_by.empty()
                          ? ""
                          : "the sizes and resistances of -" + scene.facts().surface_pressures_by +
@@ -384,7 +386,7 @@ std::string failure_text(const Scene &scene, const FailureFacts &facts, const Di
       first += "-ventilator_flow_split common_pressure, ";
     }
   }
-  text << " What to try: " << first << what_to_try(scene, d);
+  text << " What to try: " << first << what_to_try(scene, facts, d);
   return text.str();
 }
 

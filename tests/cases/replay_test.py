@@ -94,6 +94,8 @@ class Replay(unittest.TestCase):
         self.assertEqual(again.code, 0, again.tail())
         self.assertIn("with other options: -snes_max_it", again.out)
         self.assertIn("the step to t = 0.05 s was accepted", again.out)
+        self.assertFalse(os.path.exists(case.path("checkpoint.h5")))
+        self.assertNotIn("-restart", again.out)
         self.assertEqual(contents(case.directory), before)
         self.assertEqual(os.listdir(place), [])
 
@@ -102,6 +104,18 @@ class Replay(unittest.TestCase):
         self.assertTrue(os.path.isdir(case.path("replay")))
         good = pulmo.finished(SOLVER + ["-snes_max_it", "30", "-ts_max_time", "0.05", "-output_overwrite"], directory=case.directory)
         self.assertNotIn("replay", good.files())
+
+    def test_a_file_of_that_name_stays(self):
+        directory = pulmo.scratch()
+        os.mkdir(directory)
+        mine = os.path.join(directory, "replay")
+        with open(mine, "w") as f:
+            f.write("mine")
+        case = pulmo.Case(SOLVER, directory=directory)
+        self.assertEqual(case.code, 2, case.tail())
+        self.assertIn("No folder for -replay (", case.err)
+        with open(mine) as f:
+            self.assertEqual(f.read(), "mine")
 
     def test_what_is_refused(self):
         mesh = pulmo.scratch("mesh.msh")
@@ -125,6 +139,18 @@ class Replay(unittest.TestCase):
         refuse("no replay.json is there", options=["-replay", os.path.dirname(case.directory)])
         refuse("the run had 1 rank, this one has 2", ranks=2)
         refuse("there -tissue is 'yoshihara', here 'birzle'", options=["-replay", case.directory, "-tissue", "birzle"])
+        for name, value in (("-restart", file), ("-dry_run", "on"), ("-scene_view_only", "on")):
+            refuse(f"{name} does not go with -replay", options=["-replay", case.directory, name, value])
+        for changes in (dict(options=[]), dict(options=[dict(name="tissue", value="x", source="")]), dict(ranks=-1), dict(mesh="")):
+            rewritten(**changes)
+            refuse("replay.json is damaged; run the scene again")
+        rewritten()
+        state = pathlib.Path(case.path("replay/state.h5"))
+        whole = state.read_bytes()
+        for damaged in (b"", whole[:len(whole) // 2]):
+            state.write_bytes(damaged)
+            refuse("state.h5: th", "; run the scene again")
+        state.write_bytes(whole)
         rewritten(version="0.1")
         refuse("the run was one of pulmo 0.1")
         rewritten(format=99)

@@ -56,6 +56,7 @@ class StepBound(unittest.TestCase):
         self.assertEqual(case.code, 2, case.tail())
         self.assertIn("-step_J_change: |ln J| changed by ", case.err)
         self.assertIn("The bound of -step_J_change asks for shorter steps than there may be", case.err)
+        self.assertIn("What to try: a larger -step_J_change", case.err)
 
 
 if __name__ == "__main__":
