@@ -14,7 +14,7 @@ namespace {
 /// Marks a file of pulmo, and tells how to read it. Raise it when a name or a meaning changes.
 constexpr const char *marker = "pulmo_checkpoint";
 // 2: the names of the mesh, the step sizes of phases; 3: what the solver left of its equations; 4: when the
-// breath at hand is to end
+// breath at hand is to end; 5: the secants of the first guess
 constexpr int format = 5;
 
 /// @p data is resized to what is there; @p type as in memory.

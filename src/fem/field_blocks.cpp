@@ -1,6 +1,5 @@
 #include "pulmo/fem/field_blocks.hpp"
 
-#include <algorithm>
 #include <vector>
 
 namespace pulmo {

@@ -1,5 +1,6 @@
 #include "pulmo/fem/integration.hpp"
 
+#include "pulmo/base/attached.hpp"
 #include "pulmo/fem/element_products.hpp"
 
 #include <petsc/private/petscfeimpl.h>
@@ -420,51 +421,26 @@ PetscErrorCode create_fe(PetscFE fe)
 
 constexpr const char *log_name = "pulmo_integration_log", *places_name = "pulmo_places";
 
-PetscErrorCode attach_pointer(PetscDS ds, const char *name, void *pointer)
-{
-  PetscContainer container;
-
-  PetscFunctionBeginUser;
-  PetscCall(PetscContainerCreate(PETSC_COMM_SELF, &container));
-  PetscCall(PetscContainerSetPointer(container, pointer));
-  PetscCall(PetscObjectCompose((PetscObject)ds, name, (PetscObject)container));
-  PetscCall(PetscContainerDestroy(&container));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
-template <class T>
-PetscErrorCode find_pointer(PetscDS ds, const char *name, T **pointer)
-{
-  PetscContainer container;
-  void *found = nullptr;
-
-  PetscFunctionBeginUser;
-  PetscCall(PetscObjectQuery((PetscObject)ds, name, (PetscObject *)&container));
-  if (container) PetscCall(PetscContainerGetPointer(container, &found));
-  *pointer = static_cast<T *>(found);
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
 } // namespace
 
 PetscErrorCode IntegrationLog::attach(PetscDS ds, IntegrationLog *log)
 {
-  return attach_pointer(ds, log_name, log);
+  return attach_pointer((PetscObject)ds, log_name, log);
 }
 
 PetscErrorCode IntegrationLog::find(PetscDS ds, IntegrationLog **log)
 {
-  return find_pointer(ds, log_name, log);
+  return find_attached((PetscObject)ds, log_name, log);
 }
 
 PetscErrorCode PlaceData::attach(PetscDS ds, PlaceData *places)
 {
-  return attach_pointer(ds, places_name, places);
+  return attach_pointer((PetscObject)ds, places_name, places);
 }
 
 PetscErrorCode PlaceData::find(PetscDS ds, PlaceData **places)
 {
-  return find_pointer(ds, places_name, places);
+  return find_attached((PetscObject)ds, places_name, places);
 }
 
 PetscErrorCode register_fe_type()

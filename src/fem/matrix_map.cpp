@@ -1,5 +1,7 @@
 #include "pulmo/fem/matrix_map.hpp"
 
+#include "pulmo/fem/sequential_parts.hpp"
+
 #include <algorithm>
 
 namespace pulmo {
@@ -143,19 +145,15 @@ PetscErrorCode MatrixMap::find_offsets(Mat A, const PointRows &rows, Ghosts &gho
 {
   const PetscInt *garray = nullptr, *columns[2] = {nullptr, nullptr};
   PetscInt n_garray = 0;
-  PetscBool mpi;
 
   PetscFunctionBeginUser;
-  PetscCall(PetscObjectTypeCompare((PetscObject)A, MATMPIAIJ, &mpi));
-  diagonal_ = A;
-  if (mpi) {
-    PetscCall(MatMPIAIJGetSeqAIJ(A, &diagonal_, &off_diagonal_, &garray));
-    PetscCall(MatGetSize(off_diagonal_, nullptr, &n_garray));
-  }
+  PetscCall(sequential_parts(A, &diagonal_, &off_diagonal_, &garray));
+  if (off_diagonal_) PetscCall(MatGetSize(off_diagonal_, nullptr, &n_garray));
   PetscInt n_rows;
   PetscBool done;
   PetscCall(MatGetRowIJ(diagonal_, 0, PETSC_FALSE, PETSC_FALSE, &n_rows, &rows_[0], &columns[0], &done));
-  if (mpi) PetscCall(MatGetRowIJ(off_diagonal_, 0, PETSC_FALSE, PETSC_FALSE, &n_rows, &rows_[1], &columns[1], &done));
+  if (off_diagonal_)
+    PetscCall(MatGetRowIJ(off_diagonal_, 0, PETSC_FALSE, PETSC_FALSE, &n_rows, &rows_[1], &columns[1], &done));
   offset_.resize(static_cast<std::size_t>(layout_->cells) * layout_->points * layout_->points);
   for (PetscInt c = 0; c < layout_->cells; ++c) {
     const PetscInt *points = layout_->cell_points(c);

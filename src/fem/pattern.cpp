@@ -3,6 +3,7 @@
 #include "pulmo/base/huge_pages.hpp"
 #include "pulmo/fem/field_blocks.hpp"
 #include "pulmo/fem/row_groups.hpp"
+#include "pulmo/fem/sequential_parts.hpp"
 
 #include <algorithm>
 #include <numeric>
@@ -233,11 +234,10 @@ PetscErrorCode Pattern::allocate(Mat A) const
   PetscCall(MatSeqAIJSetPreallocation(A, 0, here.data()));
   PetscCall(MatMPIAIJSetPreallocation(A, 0, here.data(), 0, elsewhere.data()));
 
-  PetscBool parallel;
-  Mat owned = A;
+  Mat owned, foreign;
+  const PetscInt *columns;
   PetscScalar *entries;
-  PetscCall(PetscObjectBaseTypeCompare((PetscObject)A, MATMPIAIJ, &parallel));
-  if (parallel) PetscCall(MatMPIAIJGetSeqAIJ(A, &owned, nullptr, nullptr));
+  PetscCall(sequential_parts(A, &owned, &foreign, &columns));
   PetscCall(MatSeqAIJGetArray(owned, &entries));
   prefer_huge_pages(entries, sizeof(*entries) * std::accumulate(here.begin(), here.end(), std::size_t(0)));
   PetscCall(MatSeqAIJRestoreArray(owned, &entries));

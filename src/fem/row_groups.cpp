@@ -1,6 +1,8 @@
 #include "pulmo/fem/row_groups.hpp"
 
+#include "pulmo/base/attached.hpp"
 #include "pulmo/base/simd.hpp"
+#include "pulmo/fem/sequential_parts.hpp"
 
 #include <algorithm>
 #include <cstdint>
@@ -12,7 +14,7 @@ namespace pulmo {
 namespace {
 
 constexpr PetscInt most_rows = 4; ///< three components of the displacement and the pressure
-constexpr PetscInt row_padding = 16;
+constexpr PetscInt piece = 16;    ///< entries of a row that are multiplied together
 
 /// Reading the entries of the matrix is what takes time, and the scattered reads of the vector keep the machine from
 /// seeing that they lie one behind the other: they are asked for so many entries ahead.
@@ -48,14 +50,14 @@ void pack(const RowGroups &groups, std::size_t g, PetscInt n, const PetscScalar 
       std::copy_n(x + run.first, run.n, to);
     to += run.n;
   }
-  std::fill_n(packed + n, row_padding, 0.0);
+  std::fill_n(packed + n, piece, 0.0);
 }
 
-/// A row of @p n entries times as many of @p x, behind which zeros stand. Reads up to row_padding entries too many.
+/// A row of @p n entries times as many of @p x, behind which zeros stand. Reads whole pieces.
 PetscScalar multiply_row(PetscInt n, const PetscScalar *row, const PetscScalar *x)
 {
   Vector8 even = {}, odd = {};
-  for (PetscInt k = 0; k < n; k += 16) {
+  for (PetscInt k = 0; k < n; k += piece) {
     __builtin_prefetch(row + k + ahead);
     __builtin_prefetch(row + k + 8 + ahead);
     even += eight(row + k) * eight(x + k);
@@ -71,17 +73,15 @@ constexpr const char *name = "pulmo_row_groups";
 
 PetscErrorCode multiply(Mat A, Vec x, Vec y)
 {
-  PetscContainer container;
-  RowGroups *self;
+  RowGroups *self = nullptr;
   PetscInt rows, size;
   const PetscInt *i, *j;
   const PetscScalar *a;
   PetscBool done;
 
   PetscFunctionBeginUser;
-  PetscCall(PetscObjectQuery((PetscObject)A, name, (PetscObject *)&container));
-  PetscCheck(container, PetscObjectComm((PetscObject)A), PETSC_ERR_PLIB, "a matrix without its groups of rows");
-  PetscCall(PetscContainerGetPointer(container, (void **)&self));
+  PetscCall(find_attached((PetscObject)A, name, &self));
+  PetscCheck(self, PetscObjectComm((PetscObject)A), PETSC_ERR_PLIB, "a matrix without its groups of rows");
   PetscCall(MatGetSize(A, nullptr, &size));
   PetscCall(MatGetRowIJ(A, 0, PETSC_FALSE, PETSC_FALSE, &rows, &i, &j, &done));
   PetscCall(MatSeqAIJGetArrayRead(A, &a));
@@ -99,8 +99,8 @@ PetscErrorCode multiply(Mat A, Vec x, Vec y)
       const PetscScalar *packed = self->packed[g % 2].data();
       for (PetscInt row = self->row[g]; row < self->row[g + 1]; ++row) {
         const PetscInt n = i[row + 1] - i[row];
-        ys[row] = i[row] + n + row_padding <= i[rows] ? multiply_row(n, a + i[row], packed)
-                                                      : std::inner_product(a + i[row], a + i[row + 1], packed, 0.0);
+        ys[row] = i[row] + n + piece <= i[rows] ? multiply_row(n, a + i[row], packed)
+                                                : std::inner_product(a + i[row], a + i[row + 1], packed, 0.0);
       }
     }
   }
@@ -110,35 +110,19 @@ PetscErrorCode multiply(Mat A, Vec x, Vec y)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-#if PETSC_VERSION_LT(3, 23, 0)
-PetscErrorCode destroy(void *groups)
-{
-  delete static_cast<RowGroups *>(groups);
-  return PETSC_SUCCESS;
-}
-#else
-PetscErrorCode destroy(void **groups)
-{
-  delete static_cast<RowGroups *>(*groups);
-  return PETSC_SUCCESS;
-}
-#define PetscContainerSetUserDestroy PetscContainerSetCtxDestroy
-#endif
-
 } // namespace
 
 PetscErrorCode group_rows(Mat A)
 {
-  PetscContainer container;
+  Mat foreign;
   PetscInt rows;
-  const PetscInt *i, *j;
-  PetscBool done, sequential, parallel;
+  const PetscInt *i, *j, *columns;
+  PetscBool done, plain;
 
   PetscFunctionBeginUser;
-  PetscCall(PetscObjectTypeCompare((PetscObject)A, MATSEQAIJ, &sequential));
-  PetscCall(PetscObjectTypeCompare((PetscObject)A, MATMPIAIJ, &parallel));
-  if (parallel) PetscCall(MatMPIAIJGetSeqAIJ(A, &A, nullptr, nullptr));
-  if (!sequential && !parallel) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(PetscObjectTypeCompareAny((PetscObject)A, &plain, MATSEQAIJ, MATMPIAIJ, ""));
+  if (!plain) PetscFunctionReturn(PETSC_SUCCESS); // another product
+  PetscCall(sequential_parts(A, &A, &foreign, &columns));
   PetscCall(MatGetRowIJ(A, 0, PETSC_FALSE, PETSC_FALSE, &rows, &i, &j, &done));
   PetscCheck(done, PETSC_COMM_SELF, PETSC_ERR_SUP, "the matrix does not show its rows");
   auto *groups = new RowGroups;
@@ -163,13 +147,9 @@ PetscErrorCode group_rows(Mat A)
   }
   groups->row.push_back(rows);
   groups->runs.shrink_to_fit();
-  for (std::vector<PetscScalar> &packed : groups->packed) packed.assign(longest + row_padding, 0);
+  for (std::vector<PetscScalar> &packed : groups->packed) packed.assign(longest + piece, 0);
   PetscCall(MatRestoreRowIJ(A, 0, PETSC_FALSE, PETSC_FALSE, &rows, &i, &j, &done));
-  PetscCall(PetscContainerCreate(PETSC_COMM_SELF, &container));
-  PetscCall(PetscContainerSetPointer(container, groups));
-  PetscCall(PetscContainerSetUserDestroy(container, destroy));
-  PetscCall(PetscObjectCompose((PetscObject)A, name, (PetscObject)container));
-  PetscCall(PetscContainerDestroy(&container));
+  PetscCall(attach_owned((PetscObject)A, name, groups));
   PetscCall(MatSetOperation(A, MATOP_MULT, (void (*)())multiply));
   PetscFunctionReturn(PETSC_SUCCESS);
 }

@@ -172,8 +172,7 @@ PetscErrorCode Replay::make(bool &finished)
 PetscErrorCode Replay::observe(const StepReport &)
 {
   PetscFunctionBeginUser;
-  has_image_ = simulation_.crawls_soon();
-  if (has_image_) PetscCall(checkpoint_.make_attempt(simulation_.next_attempt(), crawl_image_));
+  if (simulation_.crawls_soon()) PetscCall(checkpoint_.make_attempt(simulation_.next_attempt(), crawl_image_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

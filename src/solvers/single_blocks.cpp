@@ -1,5 +1,7 @@
 #include "pulmo/solvers/single_blocks.hpp"
 
+#include "pulmo/fem/sequential_parts.hpp"
+
 #include <petsc/private/petscimpl.h>
 
 #include <cmath>
@@ -90,20 +92,6 @@ struct SingleBlocks {
 
   ~SingleBlocks() { (void)VecScatterDestroy(&scatter); }
 };
-
-/// Owned and foreign columns of a matrix as sequential AIJ matrices; the second one is null on one rank.
-PetscErrorCode parts(Mat A, Mat *owned, Mat *foreign, const PetscInt **columns)
-{
-  PetscBool parallel;
-
-  PetscFunctionBeginUser;
-  *owned = A;
-  *foreign = nullptr;
-  *columns = nullptr;
-  PetscCall(PetscObjectBaseTypeCompare((PetscObject)A, MATMPIAIJ, &parallel));
-  if (parallel) PetscCall(MatMPIAIJGetSeqAIJ(A, owned, foreign, columns));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
 
 /// Calls @p block(node, column node, values, length of a row of values) for each block of a sequential AIJ matrix.
 template <class Function>
@@ -284,7 +272,7 @@ PetscErrorCode create_single_blocks(Mat A, Mat *single)
   PetscCall(MatShellSetOperation(*single, MATOP_SOR, (void (*)(void))sweep));
   PetscCall(MatShellSetOperation(*single, MATOP_GET_DIAGONAL, (void (*)(void))get_diagonal));
 
-  PetscCall(parts(A, &owned, &foreign, &columns));
+  PetscCall(sequential_parts(A, &owned, &foreign, &columns));
   self->nodes = rows / 3;
   PetscCall(for_each_block(owned, [&](PetscInt node, PetscInt column, const PetscScalar *, PetscInt) {
     if (column != node) (column < node ? self->lower : self->upper).add(node, column);
@@ -324,7 +312,7 @@ PetscErrorCode update_single_blocks(Mat single, Mat A)
 
   PetscFunctionBeginUser;
   PetscCall(MatShellGetContext(single, &self));
-  PetscCall(parts(A, &owned, &foreign, &columns));
+  PetscCall(sequential_parts(A, &owned, &foreign, &columns));
   float *lower = self->lower.value.data(), *upper = self->upper.value.data();
   PetscCall(for_each_block(owned, [&](PetscInt node, PetscInt column, const PetscScalar *a, PetscInt length) {
     float *&next = column < node ? lower : upper;

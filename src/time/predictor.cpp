@@ -81,8 +81,7 @@ PetscErrorCode Predictor::accept(Vec X)
   for (auto *list : {&increment_, &change_}) std::rotate(list->begin(), list->end() - 1, list->end());
   std::rotate(slope_.begin(), slope_.end() - 1, slope_.end());
   PetscCall(VecWAXPY(increment_.front(), -1, last_, X));
-  PetscCall(VecCopy(residual_, change_.front())); // the step took the residual that it began with to nothing
-  PetscCall(VecScale(change_.front(), -1));
+  PetscCall(VecAXPBY(change_.front(), -1, 0, residual_)); // the step took the residual that it began with to nothing
   slope_.front() = tried_;
   PetscCall(VecCopy(X, last_));
   known_ = std::min<PetscInt>(known_ + 1, increments_);

@@ -1,6 +1,8 @@
 // The solvers of a simulation: TS, SNES and KSP as the options say, and what they call back.
 #include "pulmo/time/simulation.hpp"
 
+#include "pulmo/base/attached.hpp"
+
 #include <petsc/private/tsimpl.h>
 
 namespace pulmo {
@@ -60,14 +62,12 @@ constexpr const char *owner = "pulmo_simulation"; ///< of a matrix that is compo
 
 PetscErrorCode matrix_product(Mat A, Vec x, Vec y)
 {
-  PetscContainer container;
-  void *simulation;
+  Simulation *simulation = nullptr;
 
   PetscFunctionBeginUser;
-  PetscCall(PetscObjectQuery((PetscObject)A, owner, (PetscObject *)&container));
-  PetscCheck(container, PetscObjectComm((PetscObject)A), PETSC_ERR_SUP, "a copy of a bordered Jacobian");
-  PetscCall(PetscContainerGetPointer(container, &simulation));
-  PetscCall(static_cast<Simulation *>(simulation)->product(x, y));
+  PetscCall(find_attached((PetscObject)A, owner, &simulation));
+  PetscCheck(simulation, PetscObjectComm((PetscObject)A), PETSC_ERR_SUP, "a copy of a bordered Jacobian");
+  PetscCall(simulation->product(x, y));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -221,11 +221,8 @@ PetscErrorCode Simulation::create_solver()
     }
     PetscCall(SNESGetLineSearch(snes, &search));
     PetscCall(SNESLineSearchSetPreCheck(search, newton_step, this));
-    PetscContainer self; // the search for a smaller residual multiplies by the matrix to know the slope
-    PetscCall(PetscContainerCreate(comm, &self));
-    PetscCall(PetscContainerSetPointer(self, this));
-    PetscCall(PetscObjectCompose((PetscObject)(Mat)matrix_, owner, (PetscObject)self));
-    PetscCall(PetscContainerDestroy(&self));
+    // the search for a smaller residual multiplies by the matrix to know the slope
+    PetscCall(attach_pointer((PetscObject)(Mat)matrix_, owner, this));
     PetscCall(MatGetOperation(matrix_, MATOP_MULT, &multiply_));
     PetscCall(MatSetOperation(matrix_, MATOP_MULT, (void (*)())matrix_product));
   }

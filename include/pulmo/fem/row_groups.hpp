@@ -6,8 +6,8 @@
 
 namespace pulmo {
 
-/// From now on MatMult() of @p A (AIJ, assembled, with its final pattern) reads the column numbers and the entries of
-/// the vector once for all rows of a mesh point, and multiplies in vectors. The result differs from PETSc's by rounding
+/// From now on MatMult() of @p A (AIJ, assembled, with its final pattern) gathers the entries of the vector once
+/// for all rows of a mesh point, and multiplies in vectors. The result differs from PETSc's by rounding
 /// only. On several ranks the columns of other ranks stay with PETSc. Other types of matrix are left as they are.
 PetscErrorCode group_rows(Mat A);
 

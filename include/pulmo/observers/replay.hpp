@@ -43,7 +43,6 @@ private:
   std::string folder_;
   ReplayFile file_;               ///< on rank 0
   std::vector<char> crawl_image_; ///< before the step that may be the last of a crawl, on rank 0
-  bool has_image_ = false;
 };
 
 } // namespace pulmo

@@ -36,9 +36,9 @@ private:
   PetscInt increments_ = 0, known_ = 0; ///< how many to use; how many there are
   VecHandle last_;                      ///< the last accepted state
   VecHandle start_, residual_, foreseen_;
-  std::vector<VecHandle> increment_, change_; ///< the last one first
-  std::vector<PetscReal> slope_;
-  PetscReal tried_ = 0;
+  std::vector<VecHandle> increment_, change_; ///< the last one first; what each changed the residual of its step by
+  std::vector<PetscReal> slope_;              ///< of these steps, 1/s; 0: the change is of no use
+  PetscReal tried_ = 0;                       ///< that of the step at hand
   std::vector<VecHandle> direction_, secant_; ///< secants orthonormal
 };
 
