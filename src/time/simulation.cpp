@@ -37,6 +37,7 @@ PetscErrorCode Simulation::setup()
   PetscCall(DMCreateLocalVector(dm, local_.out()));
   PetscCall(VecDuplicate(local_, rate_.out()));
   PetscCall(VecDuplicate(local_, local_residual_.out()));
+  PetscCall(VecDuplicate(local_, evaluated_.local.out()));
   PetscCall(VecDuplicate(local_, before_.out()));
   PetscCall(predictor_.setup(state_));
   balance_.setup(scene_.mesh().volume(), model_.modulus());

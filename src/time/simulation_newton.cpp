@@ -4,6 +4,7 @@
 #include "pulmo/base/stopwatch.hpp"
 
 #include <algorithm>
+#include <cstring>
 #include <petsc/private/snesimpl.h>
 
 namespace pulmo {
@@ -32,8 +33,37 @@ PetscErrorCode Simulation::make_rate()
 PetscErrorCode Simulation::local_residual(PetscReal t)
 {
   PetscFunctionBeginUser;
+  evaluated_.known = false;
   PetscCall(model_.residual(t, local_, rate_, local_residual_));
   PetscCall(scheme_.add_past(model_, local_residual_));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Whether local_ at time @p t is what residual() was asked for last; Newton's last state mostly is. Collective.
+PetscErrorCode Simulation::is_evaluated(PetscReal t, bool &evaluated) const
+{
+  PetscBool same = PETSC_FALSE;
+
+  PetscFunctionBeginUser;
+  evaluated = evaluated_.known && evaluated_.t == t && std::memcmp(&evaluated_.step, &model_.step(), sizeof(Step)) == 0;
+  if (!evaluated) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(VecEqual(local_, evaluated_.local, &same)); // each rank's own
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &same, 1, MPI_INT, MPI_LAND, options_.comm()));
+  evaluated = same;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// What the state in local_ at time @p t measures.
+PetscErrorCode Simulation::measure(PetscReal t, Measures &measures) const
+{
+  bool evaluated;
+
+  PetscFunctionBeginUser;
+  PetscCall(is_evaluated(t, evaluated));
+  if (evaluated)
+    measures = evaluated_.measures;
+  else
+    PetscCall(model_.measure(local_, measures));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -73,6 +103,11 @@ PetscErrorCode Simulation::residual(PetscReal t, Vec X, Vec Xdot, Vec F)
     PetscFunctionReturn(PETSC_SUCCESS);
   }
   PetscCall(local_residual(t));
+  PetscCall(VecCopy(local_, evaluated_.local));
+  evaluated_.t = t;
+  evaluated_.step = model_.step();
+  evaluated_.measures = measures;
+  evaluated_.known = true;
   PetscCall(VecZeroEntries(F));
   PetscCall(DMLocalToGlobal(model_.dm(), local_residual_, ADD_VALUES, F));
   PetscCall(airway_.close(measures.volume_change, local_residual_, X, F));

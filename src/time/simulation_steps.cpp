@@ -84,6 +84,7 @@ PetscErrorCode Simulation::before_stage(PetscReal t)
     attempts_.back().begin = next_attempt();
     attempt_begins_ = false;
   }
+  evaluated_.known = false; // the past is another one now
   PetscCall(scheme_.begin_stage(t, dt));
   if (model_.memory()) {
     model_.memory()->settle();
@@ -171,7 +172,7 @@ PetscErrorCode Simulation::accept_stage(PetscReal t, Vec X, PetscBool *accept)
   PetscCall(airway_.apply(X));
   PetscCall(DMGlobalToLocal(model_.dm(), X, INSERT_VALUES, local_));
   PetscCall(model_.constrain(t, local_));
-  PetscCall(model_.measure(local_, measures));
+  PetscCall(measure(t, measures));
   *accept = PetscBool(measures.min_J > 0 && measures.min_air > 0);
   if (!*accept)
     PetscCall(fail(dt, measures.airless() ? "converged to a state without air" : "converged to a state with J <= 0", 0,
@@ -276,10 +277,12 @@ PetscErrorCode Simulation::judge(PetscReal t, PetscReal volume, PetscReal pressu
   Vec F;
   Model::ResidualSums sums;
   Balance::Errors errors;
+  bool evaluated;
 
   PetscFunctionBeginUser;
   PetscCall(make_rate());
-  PetscCall(local_residual(t));
+  PetscCall(is_evaluated(t, evaluated));
+  if (!evaluated) PetscCall(local_residual(t));
   PetscCall(DMGetGlobalVector(model_.dm(), &F));
   PetscCall(VecZeroEntries(F));
   PetscCall(DMLocalToGlobal(model_.dm(), local_residual_, ADD_VALUES, F));
@@ -435,7 +438,7 @@ PetscErrorCode Simulation::after_step()
   PetscCall(DMGlobalToLocal(model_.dm(), state_, INSERT_VALUES, local_));
   PetscCall(model_.constrain(t, local_));
   PetscCall(airway_.pressure(local_, pressure));
-  PetscCall(model_.measure(local_, measures));
+  PetscCall(measure(t, measures));
   row.volume = measures.volume_change / units::mm3_per_ml;
   if (model_.composition().supported()) { // judge() left this state's residual
     std::vector<std::array<PetscReal, 3>> forces;

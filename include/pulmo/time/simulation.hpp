@@ -145,6 +145,8 @@ private:
   PetscErrorCode airway_alone(bool &alone);
   PetscErrorCode make_rate();
   PetscErrorCode local_residual(PetscReal t);
+  PetscErrorCode is_evaluated(PetscReal t, bool &evaluated) const;
+  PetscErrorCode measure(PetscReal t, Measures &measures) const;
   PetscErrorCode scatter(PetscReal t, Vec X, Vec Xdot);
   Moment moment(PetscReal t, PetscReal volume, Vec local) const
   {
@@ -205,6 +207,14 @@ private:
   TSHandle ts_;
   MatHandle matrix_;
   VecHandle state_, local_, rate_, local_residual_, before_;
+  /// The state that residual() was asked for last. What follows from it need not be computed again when it is accepted.
+  struct {
+    bool known = false; ///< and local_residual_ is that of this state
+    PetscReal t = 0;
+    Step step;
+    VecHandle local;
+    Measures measures;
+  } evaluated_;
   std::vector<Phase> phases_;
   /// A phase that ended before its time.
   struct EndedPhase {
