@@ -270,7 +270,7 @@ PetscErrorCode Assembly::for_blocks(Part part, Vec x, Vec x_t, PetscInt result_s
     if (log_.timing) log_.timed_cells += n;
     PetscCall(put_places(cell_constants_, "", begin));
     PetscCall(on_cells(n, &geom, u.data(), u_t.data(), results.data()));
-    for (PetscInt i = 0; i < n; ++i) PetscCall(scatter(begin + i, &results[i * result_size]));
+    for (PetscInt i = 0; i < n; ++i) PetscCall(scatter(begin + i, ElementOf::cell, &results[i * result_size]));
   }
   log_.timing = true;
   for (const Facets *facets : facets_) {
@@ -284,7 +284,8 @@ PetscErrorCode Assembly::for_blocks(Part part, Vec x, Vec x_t, PetscInt result_s
       PetscCall(put_places(facets->constants, facets->surface, begin));
       PetscCall(on_facets(*facets, n, chunk, u.data(), u_t.data(), results.data()));
       PetscCall(PetscFEGeomRestoreChunk(facets->geom, begin, begin + n, &chunk));
-      for (PetscInt i = 0; i < n; ++i) PetscCall(scatter(facets->cells[begin + i], &results[i * result_size]));
+      for (PetscInt i = 0; i < n; ++i)
+        PetscCall(scatter(facets->cells[begin + i], ElementOf::facet, &results[i * result_size]));
     }
   }
   log_.timing = false;
@@ -350,7 +351,7 @@ PetscErrorCode Assembly::residual(Part part, PetscReal t, Vec x, Vec x_t, const 
 {
   PetscFunctionBeginUser;
   WriteArray f(F);
-  const auto scatter = [&](PetscInt cell, const PetscScalar *vector) -> PetscErrorCode {
+  const auto scatter = [&](PetscInt cell, ElementOf, const PetscScalar *vector) -> PetscErrorCode {
     const PetscInt *dofs = cell_dofs(cell);
     for (PetscInt i = 0; i < layout_.size; ++i) f[dofs[i]] += row_scale[layout_.field_of[i]] * vector[i];
     return PETSC_SUCCESS;
@@ -367,7 +368,7 @@ PetscErrorCode Assembly::weighted_residual(Part part, PetscReal t, Vec x, Vec x_
   PetscFunctionBeginUser;
   for (const Vec weight : weights) arrays.push_back(std::make_unique<ReadArray>(weight));
   sums.assign(weights.size(), std::vector<PetscReal>(static_cast<std::size_t>(layout_.cells), 0));
-  const auto scatter = [&](PetscInt cell, const PetscScalar *vector) -> PetscErrorCode {
+  const auto scatter = [&](PetscInt cell, ElementOf, const PetscScalar *vector) -> PetscErrorCode {
     const PetscInt *dofs = cell_dofs(cell);
     for (std::size_t k = 0; k < weights.size(); ++k)
       for (PetscInt i = 0; i < layout_.size; ++i)
@@ -387,8 +388,7 @@ void Assembly::change_varying(std::size_t which, PetscReal change)
 }
 
 template <class Scatter>
-PetscErrorCode Assembly::for_matrices(Part part, PetscReal t, Vec x, Vec x_t, PetscReal shift,
-                                      const PetscReal row_scale[], CellMatrices *also, Scatter &&scatter)
+PetscErrorCode Assembly::for_matrices(Part part, PetscReal t, Vec x, Vec x_t, PetscReal shift, Scatter &&scatter)
 {
   PetscFunctionBeginUser;
   const auto on_cells = [&](PetscInt n, PetscFEGeom *geom, const PetscScalar *u, const PetscScalar *u_t,
@@ -397,9 +397,6 @@ PetscErrorCode Assembly::for_matrices(Part part, PetscReal t, Vec x, Vec x_t, Pe
     for (PetscInt pair = 0; pair < n_fields_ * n_fields_; ++pair)
       PetscCall(compat::integrate_jacobian(PetscFEIntegrateJacobian, ds_, {nullptr, 0, pair, 0}, n, geom, u, u_t,
                                            rate_ds_, t, shift, matrices));
-    const auto begin = static_cast<PetscInt>((geom->detJ - detJ_.data()));
-    for (PetscInt i = 0; also && i < n; ++i)
-      PetscCall(also->add(begin + i, matrices + i * layout_.size * layout_.size, row_scale));
     PetscFunctionReturn(PETSC_SUCCESS);
   };
   const auto on_facets = [&](const Facets &facets, PetscInt n, PetscFEGeom *geom, const PetscScalar *u,
@@ -418,20 +415,25 @@ PetscErrorCode Assembly::for_matrices(Part part, PetscReal t, Vec x, Vec x_t, Pe
 }
 
 PetscErrorCode Assembly::jacobian(Part part, PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[],
-                                  Mat A, CellMatrices *also)
+                                  Mat A, const std::vector<CellMatrices *> &also)
 {
   PetscFunctionBeginUser;
   PetscCall(map_.setup(dm_, layout_, A));
   if (part == Part::all) PetscCall(MatZeroEntries(A));
   PetscCall(map_.begin());
-  const auto scatter = [&](PetscInt cell, const PetscScalar *matrix) { return map_.add(cell, matrix, row_scale, A); };
-  PetscCall(for_matrices(part, t, x, x_t, shift, row_scale, also, scatter));
+  const auto scatter = [&](PetscInt cell, ElementOf what, const PetscScalar *matrix) -> PetscErrorCode {
+    PetscFunctionBeginHot;
+    PetscCall(map_.add(cell, matrix, row_scale, A));
+    for (CellMatrices *other : also) PetscCall(other->add(cell, what, matrix, row_scale, false));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  };
+  PetscCall(for_matrices(part, t, x, x_t, shift, scatter));
   PetscCall(map_.end(A));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
 PetscErrorCode Assembly::transposed_jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[],
-                                             Mat A, CellMatrices *also)
+                                             Mat A, const std::vector<CellMatrices *> &also)
 {
   const PetscInt size = layout_.size;
   const std::vector<PetscReal> unscaled(static_cast<std::size_t>(n_fields_), 1);
@@ -441,13 +443,16 @@ PetscErrorCode Assembly::transposed_jacobian(PetscReal t, Vec x, Vec x_t, PetscR
   PetscCall(map_.setup(dm_, layout_, A));
   PetscCall(MatZeroEntries(A));
   PetscCall(map_.begin());
-  const auto scatter = [&](PetscInt cell, const PetscScalar *matrix) {
+  const auto scatter = [&](PetscInt cell, ElementOf what, const PetscScalar *matrix) -> PetscErrorCode {
+    PetscFunctionBeginHot;
     for (PetscInt i = 0; i < size; ++i)
       for (PetscInt j = 0; j < size; ++j)
         transposed[j * size + i] = row_scale[layout_.field_of[i]] * matrix[i * size + j];
-    return map_.add(cell, transposed.data(), unscaled.data(), A);
+    PetscCall(map_.add(cell, transposed.data(), unscaled.data(), A));
+    for (CellMatrices *other : also) PetscCall(other->add(cell, what, matrix, row_scale, true));
+    PetscFunctionReturn(PETSC_SUCCESS);
   };
-  PetscCall(for_matrices(Part::all, t, x, x_t, shift, row_scale, also, scatter));
+  PetscCall(for_matrices(Part::all, t, x, x_t, shift, scatter));
   PetscCall(map_.end(A));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -458,7 +463,7 @@ PetscErrorCode Assembly::add_transposed_product(PetscReal t, Vec x, Vec x_t, Pet
   PetscFunctionBeginUser;
   const ReadArray zs(z);
   WriteArray ys(y);
-  const auto scatter = [&](PetscInt cell, const PetscScalar *matrix) -> PetscErrorCode {
+  const auto scatter = [&](PetscInt cell, ElementOf, const PetscScalar *matrix) -> PetscErrorCode {
     const PetscInt *dofs = cell_dofs(cell);
     for (PetscInt i = 0; i < layout_.size; ++i) {
       const PetscScalar weight = row_scale[layout_.field_of[i]] * zs[dofs[i]];
@@ -466,14 +471,15 @@ PetscErrorCode Assembly::add_transposed_product(PetscReal t, Vec x, Vec x_t, Pet
     }
     return PETSC_SUCCESS;
   };
-  PetscCall(for_matrices(Part::all, t, x, x_t, shift, row_scale, nullptr, scatter));
+  PetscCall(for_matrices(Part::all, t, x, x_t, shift, scatter));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
 PetscErrorCode Assembly::cell_matrices(PetscReal t, Vec x, Vec x_t, PetscReal shift, const TakeMatrix &take)
 {
   PetscFunctionBeginUser;
-  PetscCall(for_matrices(Part::all, t, x, x_t, shift, nullptr, nullptr, take));
+  const auto scatter = [&](PetscInt cell, ElementOf, const PetscScalar *matrix) { return take(cell, matrix); };
+  PetscCall(for_matrices(Part::all, t, x, x_t, shift, scatter));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

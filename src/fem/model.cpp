@@ -552,12 +552,10 @@ PetscErrorCode Model::jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, Mat
 {
   PetscFunctionBeginUser;
   if (stock_loops()) PetscCall(stock_jacobian(t, x, x_t, shift, A));
-  if (also_) PetscCall(also_->begin());
+  for (CellMatrices *also : also_) PetscCall(also->begin());
   PetscCall(assembly_.jacobian(stock_loops() ? Assembly::Part::facets : Assembly::Part::all, t, x, x_t, shift,
                                row_scale_.data(), A, also_));
-  if (also_) {
-    PetscCall(also_->end(airway_.closed_points()));
-  }
+  for (CellMatrices *also : also_) PetscCall(also->end(airway_.closed_points()));
   if (closes_rows_) PetscCall(airway_.close_rows(A, composition().n_scalars() > 0));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -566,9 +564,9 @@ PetscErrorCode Model::transposed_jacobian(PetscReal t, Vec x, Vec x_t, PetscReal
 {
   PetscFunctionBeginUser;
   PetscCheck(!stock_loops(), PetscObjectComm((PetscObject)(DM)dm_), PETSC_ERR_SUP, "needs pulmo's own integration");
-  if (also_) PetscCall(also_->begin());
+  for (CellMatrices *also : also_) PetscCall(also->begin());
   PetscCall(assembly_.transposed_jacobian(t, x, x_t, shift, row_scale_.data(), A, also_));
-  if (also_) PetscCall(also_->end(airway_.closed_points()));
+  for (CellMatrices *also : also_) PetscCall(also->end(airway_.closed_points()));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

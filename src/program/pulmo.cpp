@@ -15,6 +15,7 @@
 #include "pulmo/program/notes.hpp"
 #include "pulmo/program/scene_view.hpp"
 #include "pulmo/program/unloading.hpp"
+#include "pulmo/solvers/p_multigrid.hpp"
 
 #include <algorithm>
 #include <csignal>

@@ -7,6 +7,7 @@
 #include "pulmo/mesh/mesh.hpp"
 #include "pulmo/program/prestress_notes.hpp"
 #include "pulmo/solvers/preconditioning.hpp"
+#include "pulmo/solvers/rigid_body_modes.hpp"
 
 #include <cmath>
 

@@ -97,13 +97,15 @@ PetscErrorCode FixedStress::begin()
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode FixedStress::add(PetscInt c, const PetscScalar *matrix, const PetscReal row_scale[])
+PetscErrorCode FixedStress::add(PetscInt c, ElementOf what, const PetscScalar *matrix, const PetscReal row_scale[],
+                                bool)
 {
   const PetscInt nu = n_u_, size = nu + n_p_;
   const PetscReal *w = &position_[c * nu];
   PetscScalar bulk = 0, wave = 0, storage = 0, load = 0, S[max_nodes * max_nodes];
 
   PetscFunctionBeginHot;
+  if (what == ElementOf::facet) PetscFunctionReturn(PETSC_SUCCESS);
   for (PetscInt i = 0; i < size; ++i) {
     const PetscScalar *row = matrix + i * size;
     PetscScalar along[3] = {0, 0, 0}; // of this row in direction w, by components of w

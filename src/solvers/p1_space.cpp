@@ -1,5 +1,6 @@
 #include "pulmo/solvers/p1_space.hpp"
 
+#include "pulmo/base/simd.hpp"
 #include "pulmo/fem/free_dofs.hpp"
 #include "pulmo/fem/pattern.hpp"
 #include "pulmo/mesh/elements.hpp"
@@ -156,6 +157,8 @@ PetscErrorCode P1Matrix::find_shares(DM dm, const CellLayout &cells)
 
   PetscFunctionBeginUser;
   width_ = cells.size;
+  PetscCheck(cells.size <= 3 * max_nodes, PETSC_COMM_SELF, PETSC_ERR_SUP, "elements with more than %d nodes",
+             max_nodes);
   n_u_ = static_cast<PetscInt>(std::count(cells.field_of.begin(), cells.field_of.end(), displacement));
   if (cells.cells == 0) PetscFunctionReturn(PETSC_SUCCESS);
   PetscCall(DMGetLocalSection(dm, &section));
@@ -173,7 +176,7 @@ PetscErrorCode P1Matrix::find_shares(DM dm, const CellLayout &cells)
     const ElementNode &at = nodes[(cells.cell_dofs(0)[3 * node] - offset) / 3];
     for (PetscInt i = 0; i < at.n; ++i) {
       const auto corner = std::find(corners.begin(), corners.end(), at.vertices[i]) - corners.begin();
-      shares_.push_back({node, static_cast<PetscInt>(corner), at.weights[i]});
+      shares_[corner].push_back({node, at.weights[i]});
     }
   }
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -187,28 +190,32 @@ PetscErrorCode P1Matrix::begin()
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode P1Matrix::add(PetscInt c, Place, const PetscScalar *matrix, const PetscReal row_scale[], bool transposed)
+PetscErrorCode P1Matrix::add(PetscInt c, ElementOf, const PetscScalar *matrix, const PetscReal row_scale[],
+                             bool transposed)
 {
-  PetscScalar sum[size * size] = {};
+  Vector4 row_sums[3 * max_nodes][vertices]; // three components and one without meaning
+  PetscScalar result[size * size];
 
   PetscFunctionBeginHot;
-  for (PetscInt node = 0, share = 0; node < n_u_ / 3; ++node) {
-    PetscScalar rows[3][size] = {}; // of this node, by the vertices
-    for (PetscInt i = 0; i < 3; ++i) {
-      const PetscScalar *row = matrix + (3 * node + i) * width_;
-      for (const Share &s : shares_)
-        for (PetscInt d = 0; d < 3; ++d) rows[i][3 * s.vertex + d] += s.weight * row[3 * s.node + d];
+  for (PetscInt i = 0; i < n_u_; ++i) {
+    const PetscScalar *row = matrix + i * width_;
+    for (PetscInt v = 0; v < vertices; ++v) {
+      Vector4 sum{};
+      for (const Share &s : shares_[v])
+        sum += s.weight * Vector4{row[3 * s.node], row[3 * s.node + 1], row[3 * s.node + 2], 0};
+      row_sums[i][v] = sum;
     }
-    for (; share < static_cast<PetscInt>(shares_.size()) && shares_[share].node == node; ++share)
-      for (PetscInt i = 0; i < 3; ++i) {
-        PetscScalar *to = sum + (3 * shares_[share].vertex + i) * size;
-        for (PetscInt j = 0; j < size; ++j) to[j] += shares_[share].weight * rows[i][j];
-      }
   }
+  for (PetscInt i = 0; i < size; ++i)
+    for (PetscInt v = 0; v < vertices; ++v) {
+      Vector4 sum{};
+      for (const Share &s : shares_[i / 3]) sum += s.weight * row_sums[3 * s.node + i % 3][v];
+      for (PetscInt d = 0; d < 3; ++d) result[i * size + 3 * v + d] = sum[d];
+    }
   if (transposed)
     for (PetscInt i = 0; i < size; ++i)
-      for (PetscInt j = 0; j < i; ++j) std::swap(sum[i * size + j], sum[j * size + i]);
-  PetscCall(map_.add(c, sum, &row_scale[displacement], matrix_));
+      for (PetscInt j = 0; j < i; ++j) std::swap(result[i * size + j], result[j * size + i]);
+  PetscCall(map_.add(c, result, &row_scale[displacement], matrix_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -8,6 +8,8 @@
 
 #include <petsc/private/pcimpl.h>
 
+#include <string>
+
 namespace pulmo {
 
 namespace {
@@ -16,7 +18,7 @@ struct PMultigrid {
   PC mg = nullptr;
   Mat interpolation = nullptr, coarse = nullptr;
   Mat single = nullptr; ///< the matrix in single precision, if so asked for
-  PetscBool use_single = PETSC_FALSE;
+  PetscBool use_single = PETSC_FALSE, copy = PETSC_FALSE;
 };
 
 PetscErrorCode setup_p_multigrid(PC pc)
@@ -26,12 +28,15 @@ PetscErrorCode setup_p_multigrid(PC pc)
   Mat A, B;
   KSP coarse, smoother;
   PetscInt block_size;
+  DisplacementBlock *view = nullptr;
 
   PetscFunctionBeginUser;
   PetscCall(PCGetOperators(pc, &A, &B));
   PetscCall(MatGetBlockSize(B, &block_size));
+  PetscCall(DisplacementBlock::find(B, &view));
   if (!self->mg) {
     DM dm;
+    DMHandle p1;
     PetscInt n_fields = 0, rows, fine_rows;
     PetscSection global = nullptr;
     const char *prefix;
@@ -46,8 +51,15 @@ PetscErrorCode setup_p_multigrid(PC pc)
     PetscCall(MatGetLocalSize(B, &rows, nullptr));
     PetscCall(PetscSectionGetConstrainedStorageSize(global, &fine_rows));
     PetscCheck(rows == fine_rows, comm, PETSC_ERR_ARG_SIZ, "p_multigrid: the matrix is not that of the displacement");
-    PetscCall(make_interpolation(dm, block_size, &self->interpolation, &modes));
-    PetscCall(MatPtAP(B, self->interpolation, MAT_INITIAL_MATRIX, 1, &self->coarse));
+    PetscCall(create_p1_space(dm, p1.out()));
+    PetscCall(create_p1_interpolation(dm, p1, block_size, &self->interpolation));
+    if (view) {
+      self->coarse = view->p1->matrix();
+      PetscCall(PetscObjectReference((PetscObject)self->coarse));
+    } else {
+      PetscCall(MatPtAP(B, self->interpolation, MAT_INITIAL_MATRIX, 1, &self->coarse));
+    }
+    PetscCall(create_rigid_body_modes(p1, 0, &modes));
     PetscCall(MatSetNearNullSpace(self->coarse, modes));
     PetscCall(MatNullSpaceDestroy(&modes));
     PetscCall(PCCreate(comm, &self->mg));
@@ -59,14 +71,14 @@ PetscErrorCode setup_p_multigrid(PC pc)
     PetscCall(PCMGSetLevels(self->mg, 2, nullptr));
     PetscCall(PCMGSetInterpolation(self->mg, 1, self->interpolation));
     PetscCall(PCSetFromOptions(self->mg));
-  } else {
+  } else if (!view) {
     PetscCall(MatPtAP(B, self->interpolation, MAT_REUSE_MATRIX, 1, &self->coarse));
   }
   PetscCall(PCMGGetCoarseSolve(self->mg, &coarse));
   PetscCall(KSPSetOperators(coarse, self->coarse, self->coarse));
   PetscCall(PCMGGetSmoother(self->mg, 1, &smoother));
   if (self->single) {
-    PetscCall(update_single_blocks(self->single, B));
+    PetscCall(update_single_blocks(self->single, view ? view->whole : B));
   } else if (self->use_single && block_size == 3) {
     PC smooth;
     PetscBool fits;
@@ -76,8 +88,9 @@ PetscErrorCode setup_p_multigrid(PC pc)
     PulmoUserCheck(fits, comm,
                    "-pmg_single smooths by sor, jacobi or none: change -fieldsplit_displacement_pmg_levels_pc_type or "
                    "add -fieldsplit_displacement_pmg_single off");
-    PetscCall(create_single_blocks(B, &self->single));
+    PetscCall(create_single_blocks(view ? view->whole : B, view ? view->rows : nullptr, &self->single));
   }
+  PetscCheck(self->single || !view, comm, PETSC_ERR_PLIB, "a view of the displacement without -pmg_single");
   if (self->single) A = B = self->single;
   PetscCall(KSPSetOperators(smoother, A, B));
   PetscCall(PCSetOperators(self->mg, A, B));
@@ -121,6 +134,11 @@ PetscErrorCode p_multigrid_options(PC pc, compat::OptionItems PetscOptionsObject
   PetscOptionsHeadBegin(PetscOptionsObject, "p-multigrid");
   PetscCall(PetscOptionsBool("-pmg_single", "keep the displacement's matrix in single precision for the smoother", "",
                              self->use_single, &self->use_single, nullptr));
+  PetscCall(
+      PetscOptionsBool("-pmg_copy",
+                       "copy the displacement's block out of the matrix and make that of P1 by a Galerkin product "
+                       "(with -pmg_single neither is needed)",
+                       "", self->copy, &self->copy, nullptr));
   PetscOptionsHeadEnd();
   PetscFunctionReturn(PETSC_SUCCESS);
 }
@@ -149,6 +167,20 @@ PetscErrorCode create_p_multigrid(PC pc)
 }
 
 } // namespace
+
+PetscErrorCode reads_in_place(const char *prefix, bool &reads)
+{
+  const std::string begin = std::string("-") + prefix;
+  char type[64] = "";
+  PetscBool single = PETSC_FALSE, copy = PETSC_FALSE;
+
+  PetscFunctionBeginUser;
+  PetscCall(PetscOptionsGetString(nullptr, nullptr, (begin + "pc_type").c_str(), type, sizeof(type), nullptr));
+  PetscCall(PetscOptionsGetBool(nullptr, nullptr, (begin + "pmg_single").c_str(), &single, nullptr));
+  PetscCall(PetscOptionsGetBool(nullptr, nullptr, (begin + "pmg_copy").c_str(), &copy, nullptr));
+  reads = std::string(type) == "p_multigrid" && single && !copy;
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
 
 PetscErrorCode register_p_multigrid()
 {

@@ -5,6 +5,7 @@
 #include <petsc/private/petscimpl.h>
 
 #include <cmath>
+#include <numeric>
 #include <utility>
 #include <vector>
 
@@ -86,6 +87,8 @@ struct SingleBlocks {
   Blocks lower, upper, foreign; ///< columns before and behind the diagonal; columns of other ranks
   std::vector<float> diagonal, inverse;
   PetscInt nodes = 0;
+  std::vector<PetscInt> row;                      ///< [node]: the first of its three in the matrix's part of this rank
+  std::vector<PetscInt> node_of, foreign_node_of; ///< [column] of the two parts; -1: not wanted
   NodeVectors x, b, r, ghosts;
   VecHandle ghost_values;
   VecScatter scatter = nullptr;
@@ -94,8 +97,10 @@ struct SingleBlocks {
 };
 
 /// Calls @p block(node, column node, values, length of a row of values) for each block of a sequential AIJ matrix.
+/// @p row: the first of each node's; @p node_of: the node of each column, -1 for one that is not wanted.
 template <class Function>
-PetscErrorCode for_each_block(Mat A, const Function &block)
+PetscErrorCode for_each_block(Mat A, const std::vector<PetscInt> &row, const std::vector<PetscInt> &node_of,
+                              const Function &block)
 {
   PetscInt rows;
   const PetscInt *i, *j;
@@ -106,11 +111,21 @@ PetscErrorCode for_each_block(Mat A, const Function &block)
   PetscCall(MatGetRowIJ(A, 0, PETSC_FALSE, PETSC_FALSE, &rows, &i, &j, &done));
   PetscCheck(done, PETSC_COMM_SELF, PETSC_ERR_SUP, "the matrix does not show its rows");
   PetscCall(MatSeqAIJGetArrayRead(A, &a));
-  for (PetscInt row = 0; row < rows; row += 3) {
-    const PetscInt length = i[row + 1] - i[row];
-    PetscCheck(length % 3 == 0 && i[row + 2] - i[row + 1] == length && i[row + 3] - i[row + 2] == length,
-               PETSC_COMM_SELF, PETSC_ERR_ARG_WRONG, "the matrix is not made of 3 x 3 blocks");
-    for (PetscInt k = i[row]; k < i[row + 1]; k += 3) block(row / 3, j[k] / 3, a + k, length);
+  for (std::size_t node = 0; node < row.size(); ++node) {
+    const PetscInt r = row[node], length = i[r + 1] - i[r];
+    PetscCheck(i[r + 2] - i[r + 1] == length && i[r + 3] - i[r + 2] == length, PETSC_COMM_SELF, PETSC_ERR_ARG_WRONG,
+               "the matrix is not made of 3 x 3 blocks");
+    for (PetscInt k = i[r]; k < i[r + 1];) {
+      const PetscInt column = node_of[j[k]];
+      if (column < 0) {
+        ++k;
+        continue;
+      }
+      PetscCheck(k + 2 < i[r + 1] && node_of[j[k + 2]] == column, PETSC_COMM_SELF, PETSC_ERR_ARG_WRONG,
+                 "the matrix is not made of 3 x 3 blocks");
+      block(static_cast<PetscInt>(node), column, a + k, length);
+      k += 3;
+    }
   }
   PetscCall(MatSeqAIJRestoreArrayRead(A, &a));
   PetscCall(MatRestoreRowIJ(A, 0, PETSC_FALSE, PETSC_FALSE, &rows, &i, &j, &done));
@@ -251,20 +266,95 @@ PetscErrorCode destroy(Mat single)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+/// The nodes of this rank and of the columns of @p owned.
+PetscErrorCode find_nodes(SingleBlocks &self, Mat A, IS rows)
+{
+  PetscInt begin, end, n;
+
+  PetscFunctionBeginUser;
+  PetscCall(MatGetOwnershipRange(A, &begin, &end));
+  std::vector<PetscInt> wanted(static_cast<std::size_t>(end - begin));
+  std::iota(wanted.begin(), wanted.end(), 0);
+  if (rows) {
+    const PetscInt *row;
+    PetscCall(ISGetLocalSize(rows, &n));
+    PetscCall(ISGetIndices(rows, &row));
+    wanted.resize(static_cast<std::size_t>(n));
+    for (PetscInt i = 0; i < n; ++i) wanted[i] = row[i] - begin;
+    PetscCall(ISRestoreIndices(rows, &row));
+  }
+  self.nodes = static_cast<PetscInt>(wanted.size()) / 3;
+  self.node_of.assign(static_cast<std::size_t>(end - begin), -1);
+  for (PetscInt node = 0; node < self.nodes; ++node) {
+    const PetscInt first = wanted[3 * node];
+    self.row.push_back(first);
+    for (PetscInt d = 0; d < 3; ++d) {
+      PetscCheck(wanted[3 * node + d] == first + d, PETSC_COMM_SELF, PETSC_ERR_ARG_WRONG,
+                 "the rows are not those of whole nodes");
+      self.node_of[first + d] = node;
+    }
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Those of other ranks whose columns are @p columns of @p A, and the way to their vectors.
+PetscErrorCode find_ghosts(SingleBlocks &self, Mat A, Mat foreign, const PetscInt columns[])
+{
+  PetscInt n, begin, block_begin;
+  VecHandle number, numbers, x;
+  ISHandle from, of_block;
+  VecScatter scatter;
+  std::vector<PetscInt> ghosts; // numbers in the block
+
+  PetscFunctionBeginUser;
+  // each rank tells the numbers that its columns have in the block
+  PetscCall(MatGetOwnershipRange(A, &begin, nullptr));
+  PetscCall(MatCreateVecs(A, number.out(), nullptr));
+  PetscCall(VecCreateMPI(PetscObjectComm((PetscObject)A), 3 * self.nodes, PETSC_DETERMINE, x.out()));
+  PetscCall(VecGetOwnershipRange(x, &block_begin, nullptr));
+  PetscCall(VecSet(number, -1));
+  {
+    WriteArray value(number);
+    for (PetscInt node = 0; node < self.nodes; ++node)
+      for (PetscInt d = 0; d < 3; ++d) value[self.row[node] + d] = block_begin + 3 * node + d;
+  }
+  PetscCall(MatGetLocalSize(foreign, nullptr, &n));
+  PetscCall(ISCreateGeneral(PETSC_COMM_SELF, n, columns, PETSC_COPY_VALUES, from.out()));
+  PetscCall(VecCreateSeq(PETSC_COMM_SELF, n, numbers.out()));
+  PetscCall(VecScatterCreate(number, from, numbers, nullptr, &scatter));
+  PetscCall(VecScatterBegin(scatter, number, numbers, INSERT_VALUES, SCATTER_FORWARD));
+  PetscCall(VecScatterEnd(scatter, number, numbers, INSERT_VALUES, SCATTER_FORWARD));
+  PetscCall(VecScatterDestroy(&scatter));
+  self.foreign_node_of.assign(static_cast<std::size_t>(n), -1);
+  {
+    const ReadArray value(numbers);
+    for (PetscInt k = 0; k < n; ++k)
+      if (value[k] >= 0) {
+        self.foreign_node_of[k] = static_cast<PetscInt>(ghosts.size()) / 3;
+        ghosts.push_back(static_cast<PetscInt>(value[k]));
+      }
+  }
+  const auto n_ghosts = static_cast<PetscInt>(ghosts.size());
+  PetscCall(ISCreateGeneral(PETSC_COMM_SELF, n_ghosts, ghosts.data(), PETSC_COPY_VALUES, of_block.out()));
+  PetscCall(VecCreateSeq(PETSC_COMM_SELF, n_ghosts, self.ghost_values.out()));
+  PetscCall(VecScatterCreate(x, of_block, self.ghost_values, nullptr, &self.scatter));
+  self.ghosts.assign(vector_size * (n_ghosts / 3), 0);
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 } // namespace
 
-PetscErrorCode create_single_blocks(Mat A, Mat *single)
+PetscErrorCode create_single_blocks(Mat A, IS rows, Mat *single)
 {
   const MPI_Comm comm = PetscObjectComm((PetscObject)A);
   auto *self = new SingleBlocks;
   Mat owned, foreign;
   const PetscInt *columns;
-  PetscInt rows, row_count;
 
   PetscFunctionBeginUser;
-  PetscCall(MatGetLocalSize(A, &rows, nullptr));
-  PetscCall(MatGetSize(A, &row_count, nullptr));
-  PetscCall(MatCreateShell(comm, rows, rows, row_count, row_count, self, single));
+  PetscCall(sequential_parts(A, &owned, &foreign, &columns));
+  PetscCall(find_nodes(*self, A, rows));
+  PetscCall(MatCreateShell(comm, 3 * self->nodes, 3 * self->nodes, PETSC_DETERMINE, PETSC_DETERMINE, self, single));
   PetscCall(MatSetBlockSize(*single, 3));
   PetscCall(MatShellSetOperation(*single, MATOP_DESTROY, (void (*)(void))destroy));
   PetscCall(MatShellSetOperation(*single, MATOP_MULT, (void (*)(void))multiply));
@@ -272,29 +362,18 @@ PetscErrorCode create_single_blocks(Mat A, Mat *single)
   PetscCall(MatShellSetOperation(*single, MATOP_SOR, (void (*)(void))sweep));
   PetscCall(MatShellSetOperation(*single, MATOP_GET_DIAGONAL, (void (*)(void))get_diagonal));
 
-  PetscCall(sequential_parts(A, &owned, &foreign, &columns));
-  self->nodes = rows / 3;
-  PetscCall(for_each_block(owned, [&](PetscInt node, PetscInt column, const PetscScalar *, PetscInt) {
-    if (column != node) (column < node ? self->lower : self->upper).add(node, column);
-  }));
+  PetscCall(for_each_block(owned, self->row, self->node_of,
+                           [&](PetscInt node, PetscInt column, const PetscScalar *, PetscInt) {
+                             if (column != node) (column < node ? self->lower : self->upper).add(node, column);
+                           }));
   for (NodeVectors *v : {&self->x, &self->b, &self->r}) v->assign(vector_size * self->nodes, 0);
   self->diagonal.assign(block_size * self->nodes + 1, 0);
   self->inverse.assign(block_size * self->nodes + 1, 0);
   if (foreign) {
-    PetscInt ghosts;
-    IS from;
-    Vec x;
-    PetscCall(for_each_block(foreign, [&](PetscInt node, PetscInt column, const PetscScalar *, PetscInt) {
-      self->foreign.add(node, column);
-    }));
-    PetscCall(MatGetLocalSize(foreign, nullptr, &ghosts));
-    PetscCall(ISCreateGeneral(PETSC_COMM_SELF, ghosts, columns, PETSC_USE_POINTER, &from));
-    PetscCall(VecCreateSeq(PETSC_COMM_SELF, ghosts, self->ghost_values.out()));
-    PetscCall(MatCreateVecs(A, &x, nullptr));
-    PetscCall(VecScatterCreate(x, from, self->ghost_values, nullptr, &self->scatter));
-    PetscCall(VecDestroy(&x));
-    PetscCall(ISDestroy(&from));
-    self->ghosts.assign(vector_size * (ghosts / 3), 0);
+    PetscCall(find_ghosts(*self, A, foreign, columns));
+    PetscCall(for_each_block(
+        foreign, self->row, self->foreign_node_of,
+        [&](PetscInt node, PetscInt column, const PetscScalar *, PetscInt) { self->foreign.add(node, column); }));
   }
   for (Blocks *blocks : {&self->lower, &self->upper, &self->foreign}) {
     blocks->close_rows(self->nodes);
@@ -314,18 +393,20 @@ PetscErrorCode update_single_blocks(Mat single, Mat A)
   PetscCall(MatShellGetContext(single, &self));
   PetscCall(sequential_parts(A, &owned, &foreign, &columns));
   float *lower = self->lower.value.data(), *upper = self->upper.value.data();
-  PetscCall(for_each_block(owned, [&](PetscInt node, PetscInt column, const PetscScalar *a, PetscInt length) {
-    float *&next = column < node ? lower : upper;
-    float *B = column == node ? &self->diagonal[block_size * node] : std::exchange(next, next + block_size);
-    copy_block(a, length, B);
-  }));
+  PetscCall(for_each_block(
+      owned, self->row, self->node_of, [&](PetscInt node, PetscInt column, const PetscScalar *a, PetscInt length) {
+        float *&next = column < node ? lower : upper;
+        float *B = column == node ? &self->diagonal[block_size * node] : std::exchange(next, next + block_size);
+        copy_block(a, length, B);
+      }));
   for (PetscInt node = 0; node < self->nodes; ++node)
     invert(&self->diagonal[block_size * node], &self->inverse[block_size * node]);
   if (foreign) {
     float *next = self->foreign.value.data();
-    PetscCall(for_each_block(foreign, [&](PetscInt, PetscInt, const PetscScalar *a, PetscInt length) {
-      copy_block(a, length, std::exchange(next, next + block_size));
-    }));
+    PetscCall(for_each_block(foreign, self->row, self->foreign_node_of,
+                             [&](PetscInt, PetscInt, const PetscScalar *a, PetscInt length) {
+                               copy_block(a, length, std::exchange(next, next + block_size));
+                             }));
   }
   PetscCall(PetscObjectStateIncrease((PetscObject)single));
   PetscFunctionReturn(PETSC_SUCCESS);

@@ -2,6 +2,10 @@
 #include "pulmo/time/simulation.hpp"
 
 #include "pulmo/base/attached.hpp"
+#include "pulmo/solvers/displacement_block.hpp"
+#include "pulmo/solvers/p_multigrid.hpp"
+#include "pulmo/solvers/preconditioning.hpp"
+#include "pulmo/solvers/rigid_body_modes.hpp"
 
 #include <petsc/private/tsimpl.h>
 
@@ -179,6 +183,7 @@ PetscErrorCode Simulation::create_solver()
   PetscCall(SNESSetComputeInitialGuess(snes, initial_guess, this));
   PetscCall(compat::set_from_options(ts_));
   PetscCall(offer_fixed_stress(ksp));
+  PetscCall(offer_view(ksp));
   PetscCall(lagging_.setup(snes));
   PetscCall(SNESSetConvergenceHistory(snes, nullptr, nullptr, PETSC_DECIDE, PETSC_TRUE));
   PetscBool tests_jacobian;
@@ -263,6 +268,27 @@ PetscErrorCode Simulation::offer_fixed_stress(KSP ksp)
   PetscCall(fixed_stress_.setup(model_.dm(), model_.assembly()));
   model_.also_fill(fixed_stress_);
   PetscCall(PCFieldSplitSetSchurPre(pc, type, fixed_stress_.matrix()));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+/// Where the displacement's preconditioner needs no copy of its block, none is made.
+PetscErrorCode Simulation::offer_view(KSP ksp)
+{
+  PC pc;
+  PetscBool fieldsplit, aij;
+  bool reads, fits;
+
+  PetscFunctionBeginUser;
+  PetscCall(KSPGetPC(ksp, &pc));
+  PetscCall(PetscObjectTypeCompare((PetscObject)pc, PCFIELDSPLIT, &fieldsplit));
+  PetscCall(PetscObjectBaseTypeCompareAny((PetscObject)(Mat)matrix_, &aij, MATSEQAIJ, MATMPIAIJ, ""));
+  PetscCall(reads_in_place("fieldsplit_displacement_", reads));
+  if (!fieldsplit || !aij || !reads || !scene_.facts().airflow || !model_.own_integration())
+    PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(p1_.setup(model_.dm(), model_.assembly(), fits));
+  if (!fits) PetscFunctionReturn(PETSC_SUCCESS);
+  model_.also_fill(p1_);
+  PetscCall(view_displacement(matrix_, model_.field_rows(displacement), p1_));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

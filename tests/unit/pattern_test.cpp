@@ -1,4 +1,5 @@
 // The sparsity patterns that pulmo finds, beside those of DMCreateMatrix; on any number of ranks.
+#include "pulmo/solvers/fixed_stress.hpp"
 #include "unit/scenes.hpp"
 
 #include <set>

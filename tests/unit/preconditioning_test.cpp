@@ -1,6 +1,11 @@
 // What options files can pick: rigid-body modes, p-multigrid, the fixed-stress matrix.
+#include "pulmo/solvers/displacement_block.hpp"
+#include "pulmo/solvers/fixed_stress.hpp"
+#include "pulmo/solvers/p1_space.hpp"
 #include "pulmo/solvers/single_blocks.hpp"
 #include "unit/scenes.hpp"
+
+#include <petsc/private/petscimpl.h>
 
 namespace pulmo::test {
 namespace {
@@ -137,7 +142,7 @@ TEST(SingleBlocks, MultiplyAndSmoothAsPetscDoesInDouble)
   PULMO_OK(prepare(run, cube("cube.msh") + springs));
   PULMO_OK(jacobian_at_rest(run, A.out()));
   PULMO_OK(MatConvert(A, MATBAIJ, MAT_INITIAL_MATRIX, blocks.out()));
-  PULMO_OK(create_single_blocks(A, single.out()));
+  PULMO_OK(create_single_blocks(A, nullptr, single.out()));
   PULMO_OK(MatCreateVecs(A, x.out(), b.out()));
   for (VecHandle *v : {&y, &expected, &result}) PULMO_OK(VecDuplicate(x, v->out()));
   PULMO_OK(VecSetRandom(x, nullptr));
@@ -174,7 +179,7 @@ TEST(SingleBlocks, FollowTheMatrix)
   VecHandle x, expected, result;
   PULMO_OK(prepare(run, cube("cube_coarse.msh") + springs));
   PULMO_OK(jacobian_at_rest(run, A.out()));
-  PULMO_OK(create_single_blocks(A, single.out()));
+  PULMO_OK(create_single_blocks(A, nullptr, single.out()));
   PULMO_OK(MatCreateVecs(A, x.out(), expected.out()));
   PULMO_OK(VecDuplicate(x, result.out()));
   PULMO_OK(VecSetRandom(x, nullptr));
@@ -256,6 +261,192 @@ TEST(PMultigrid, SinglePrecisionPreconditionsAsDouble)
     PULMO_OK(VecScale(x[3], 2));
     EXPECT_LT(relative_difference(x[1], x[3]), 1e-5) << "after new values: " << hold;
   }
+}
+
+/// A lung with air in a deformed state: its Jacobian, that of P1 by cells and what the displacement's block is by
+/// PETSc's own means.
+struct Deformed {
+  const Registry registry = Registry::standard();
+  SceneRun run{registry};
+  P1Matrix p1;
+  MatHandle A, copy;
+  DMHandle displacements;
+  VecHandle x, x_t;
+  IS rows = nullptr;
+  bool fits = false;
+
+  PetscErrorCode setup(const std::string &options)
+  {
+    const PetscInt field = displacement;
+    PetscRandom random;
+
+    PetscFunctionBeginUser;
+    PetscCall(prepare(run, cube("cube.msh") +
+                               "-airflow -airflow_surfaces x1 -lumen_pressure -lumen_pressure_surfaces x1 " + options));
+    const DM dm = run.model().dm();
+    rows = run.model().field_rows(displacement);
+    PetscCall(DMCreateSubDM(dm, 1, &field, nullptr, displacements.out()));
+    PetscCall(run.model().create_matrix(A.out()));
+    PetscCall(run.model().set_step(0.05, 0.3));
+    PetscCall(DMCreateLocalVector(dm, x.out()));
+    PetscCall(VecDuplicate(x, x_t.out()));
+    VecHandle global; // ranks see one state
+    PetscCall(DMCreateGlobalVector(dm, global.out()));
+    PetscCall(PetscRandomCreate(PETSC_COMM_WORLD, &random));
+    PetscCall(PetscRandomSetInterval(random, -0.01, 0.01));
+    PetscCall(VecSetRandom(global, random));
+    PetscCall(PetscRandomDestroy(&random));
+    PetscCall(DMGlobalToLocal(dm, global, INSERT_VALUES, x));
+    PetscCall(p1.setup(dm, run.model().assembly(), fits));
+    if (fits) run.model().also_fill(p1);
+    PetscCall(assemble(false));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+  PetscErrorCode assemble(bool transposed)
+  {
+    PetscFunctionBeginUser;
+    if (transposed)
+      PetscCall(run.model().transposed_jacobian(0, x, x_t, 20, A));
+    else
+      PetscCall(run.model().jacobian(0, x, x_t, 20, A));
+    PetscCall(MatCreateSubMatrix(A, rows, rows, MAT_INITIAL_MATRIX, copy.out()));
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
+};
+
+TEST(P1Matrix, IsTheGalerkinMatrixOfTheDisplacement)
+{
+  for (const char *elements : {"P2-P1", "P1-P1", "P3-P2"})
+    for (const std::string &hold : {std::string(springs), " -support -support_surfaces x0 " + std::string(springs)}) {
+      SCOPED_TRACE(elements + hold);
+      Deformed lung;
+      PULMO_OK(lung.setup(hold + " -elements " + elements));
+      ASSERT_TRUE(lung.fits);
+      DMHandle space;
+      MatHandle P;
+      PULMO_OK(create_p1_space(lung.displacements, space.out()));
+      PULMO_OK(create_p1_interpolation(lung.displacements, space, 3, P.out()));
+      for (const bool transposed : {false, true}) {
+        MatHandle product;
+        PetscReal size, difference;
+        PULMO_OK(lung.assemble(transposed));
+        PULMO_OK(MatPtAP(lung.copy, P, MAT_INITIAL_MATRIX, 1, product.out()));
+        PULMO_OK(MatNorm(product, NORM_INFINITY, &size));
+        PULMO_OK(MatAXPY(product, -1, lung.p1.matrix(), DIFFERENT_NONZERO_PATTERN));
+        PULMO_OK(MatNorm(product, NORM_INFINITY, &difference));
+        EXPECT_LT(difference, 1e-13 * size) << (transposed ? "transposed" : "");
+      }
+    }
+}
+
+TEST(P1Matrix, DoesNotFitNodesThatAreHeldInPart)
+{
+  Deformed lung;
+  PULMO_OK(lung.setup(" -support -support_surfaces x0,y0 -support_components_y0 y "));
+  EXPECT_FALSE(lung.fits);
+}
+
+PetscErrorCode renew(const Deformed &lung, Mat block)
+{
+  return MatCreateSubMatrix(lung.A, lung.rows, lung.rows, MAT_REUSE_MATRIX, &block);
+}
+
+TEST(DisplacementBlock, StandsForACopy)
+{
+  Deformed lung;
+  PULMO_OK(lung.setup(springs));
+  MatHandle block, other, single, single_of_copy;
+  DisplacementBlock *found = nullptr;
+  VecHandle x, b, expected, result;
+  const IS pressures = lung.run.model().field_rows(pressure);
+  PULMO_OK(view_displacement(lung.A, lung.rows, lung.p1));
+  PULMO_OK(MatCreateSubMatrix(lung.A, lung.rows, lung.rows, MAT_INITIAL_MATRIX, block.out()));
+  PULMO_OK(DisplacementBlock::find(block, &found));
+  ASSERT_NE(found, nullptr);
+  EXPECT_EQ(found->whole, (Mat)lung.A);
+  PULMO_OK(MatCreateSubMatrix(lung.A, lung.rows, pressures, MAT_INITIAL_MATRIX, other.out()));
+  PULMO_OK(DisplacementBlock::find(other, &found));
+  EXPECT_EQ(found, nullptr) << "all other blocks are copies";
+  PULMO_OK(create_single_blocks(lung.A, lung.rows, single.out()));
+  PULMO_OK(create_single_blocks(lung.copy, nullptr, single_of_copy.out()));
+  PULMO_OK(MatCreateVecs(lung.copy, x.out(), b.out()));
+  for (VecHandle *v : {&expected, &result}) PULMO_OK(VecDuplicate(x, v->out()));
+  PULMO_OK(VecSetRandom(x, nullptr));
+  PULMO_OK(VecSetRandom(b, nullptr));
+  for (const double factor : {1., 3.}) {
+    PetscObjectState before, after;
+    PULMO_OK(PetscObjectStateGet((PetscObject)(Mat)block, &before));
+    PULMO_OK(MatScale(lung.A, factor));
+    PULMO_OK(MatScale(lung.copy, factor));
+    PULMO_OK(renew(lung, block));
+    PULMO_OK(PetscObjectStateGet((PetscObject)(Mat)block, &after));
+    EXPECT_GT(after, before) << "who keeps what was made of it must see that it changed";
+    PULMO_OK(update_single_blocks(single, lung.A));
+    PULMO_OK(update_single_blocks(single_of_copy, lung.copy));
+    PULMO_OK(MatMult(lung.copy, x, expected));
+    PULMO_OK(MatMult(block, x, result));
+    EXPECT_LT(relative_difference(expected, result), 1e-14);
+    PULMO_OK(MatGetDiagonal(lung.copy, expected));
+    PULMO_OK(MatGetDiagonal(block, result));
+    EXPECT_EQ(relative_difference(expected, result), 0);
+    // the same blocks in the same order, so the same numbers
+    PULMO_OK(MatMult(single_of_copy, x, expected));
+    PULMO_OK(MatMult(single, x, result));
+    EXPECT_EQ(relative_difference(expected, result), 0);
+    PULMO_OK(VecCopy(x, expected));
+    PULMO_OK(VecCopy(x, result));
+    PULMO_OK(MatSOR(single_of_copy, b, 1, SOR_LOCAL_SYMMETRIC_SWEEP, 0, 2, 1, expected));
+    PULMO_OK(MatSOR(single, b, 1, SOR_LOCAL_SYMMETRIC_SWEEP, 0, 2, 1, result));
+    EXPECT_EQ(relative_difference(expected, result), 0);
+  }
+}
+
+TEST(PMultigrid, NeedsNoCopyOfItsBlock)
+{
+  Deformed lung;
+  PULMO_OK(lung.setup(springs));
+  const std::string options =
+      " -test_pmg_single -test_pmg_levels_ksp_type richardson -test_pmg_levels_ksp_max_it 1 -test_pmg_levels_pc_type "
+      "sor "
+      "-test_pmg_coarse_ksp_type preonly -test_pmg_coarse_pc_type lu -test_pmg_coarse_pc_factor_mat_solver_type mumps ";
+  PULMO_OK(PetscOptionsInsertString(nullptr, options.c_str()));
+  MatHandle block;
+  VecHandle b;
+  std::array<VecHandle, 4> y; // copy, view; again with new values
+  std::array<PC, 2> pcs;
+  PULMO_OK(view_displacement(lung.A, lung.rows, lung.p1));
+  PULMO_OK(MatCreateSubMatrix(lung.A, lung.rows, lung.rows, MAT_INITIAL_MATRIX, block.out()));
+  PULMO_OK(MatCreateVecs(lung.copy, b.out(), nullptr));
+  PULMO_OK(VecSetRandom(b, nullptr));
+  for (std::size_t i = 0; i < y.size(); ++i) {
+    PC &pc = pcs[i % 2];
+    const Mat A = i % 2 ? (Mat)block : (Mat)lung.copy;
+    if (i < 2) {
+      PULMO_OK(PCCreate(PETSC_COMM_WORLD, &pc));
+      PULMO_OK(PCSetDM(pc, lung.displacements));
+      PULMO_OK(PCSetType(pc, "p_multigrid"));
+      PULMO_OK(PCSetOptionsPrefix(pc, "test_"));
+      PULMO_OK(PCSetFromOptions(pc));
+    }
+    if (i == 2) {
+      PULMO_OK(lung.run.model().set_step(0.05, 1.5));
+      PULMO_OK(VecScale(lung.x, -2));
+      PULMO_OK(lung.run.model().jacobian(0, lung.x, lung.x_t, 20, lung.A));
+      PULMO_OK(renew(lung, block));
+      MatHandle other, values; // for a copy, which the matrix does not make any more
+      PULMO_OK(lung.run.model().create_matrix(other.out()));
+      PULMO_OK(lung.run.model().jacobian(0, lung.x, lung.x_t, 20, other));
+      PULMO_OK(MatCreateSubMatrix(other, lung.rows, lung.rows, MAT_INITIAL_MATRIX, values.out()));
+      PULMO_OK(MatCopy(values, lung.copy, SAME_NONZERO_PATTERN));
+    }
+    PULMO_OK(PCSetOperators(pc, A, A));
+    PULMO_OK(VecDuplicate(b, y[i].out()));
+    PULMO_OK(PCApply(pc, b, y[i]));
+  }
+  EXPECT_LT(relative_difference(y[0], y[1]), 1e-6);
+  EXPECT_LT(relative_difference(y[2], y[3]), 1e-6);
+  EXPECT_GT(relative_difference(y[0], y[2]), 1e-3) << "new values changed nothing";
+  for (PC &pc : pcs) PULMO_OK(PCDestroy(&pc));
 }
 
 /// x' S x / x' S_exact x for several x, with the exact Schur complement on the pressure.

@@ -33,14 +33,19 @@ struct Measures {
 class ParameterFields;
 class PointMemory;
 
-/// Takes the element matrices of the cells while a Jacobian is assembled.
+/// What an element matrix or vector is the share of.
+enum class ElementOf { cell, facet };
+
+/// Takes the element matrices while a Jacobian is assembled.
 class CellMatrices {
 public:
   virtual ~CellMatrices() = default;
   /// Begins a new Jacobian.
   virtual PetscErrorCode begin() = 0;
-  /// Adds cell @p c (counted from 0) from its element matrix, rows scaled by @p row_scale.
-  virtual PetscErrorCode add(PetscInt c, const PetscScalar *matrix, const PetscReal row_scale[]) = 0;
+  /// Adds cell @p c (counted from 0), or a facet of it, from its element matrix, rows scaled by @p row_scale; what is
+  /// assembled is the transposed of that if @p transposed.
+  virtual PetscErrorCode add(PetscInt c, ElementOf what, const PetscScalar *matrix, const PetscReal row_scale[],
+                             bool transposed) = 0;
   /// Completes it; @p closed: mesh points whose pressure is held. Collective.
   virtual PetscErrorCode end(const std::vector<PetscInt> &closed) = 0;
 };
@@ -76,12 +81,12 @@ public:
   /// Adds @p change to a constant that differs from place to place (ParameterFields::offsets()), wherever it is.
   void change_varying(std::size_t which, PetscReal change);
   /// A = dF/dx + shift dF/dx_t, rows scaled alike; Part::facets adds to A.
-  /// With @p also the element matrices of the cells go there too. Collective.
+  /// The element matrices go to each of @p also, too. Collective.
   PetscErrorCode jacobian(Part part, PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[], Mat A,
-                          CellMatrices *also = nullptr);
+                          const std::vector<CellMatrices *> &also = {});
   /// The same transposed, for Part::all; columns of A are what is scaled then.
   PetscErrorCode transposed_jacobian(PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[], Mat A,
-                                     CellMatrices *also = nullptr);
+                                     const std::vector<CellMatrices *> &also = {});
   /// Adds that transposed Jacobian times @p z to @p y, element by element and without a matrix. All are local vectors;
   /// what is held has rows and columns, too.
   PetscErrorCode add_transposed_product(PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[],
@@ -131,8 +136,7 @@ private:
   PetscErrorCode for_vectors(Part part, PetscReal t, Vec x, Vec x_t, Scatter &&scatter);
   /// The same for the matrices of dF/dx + shift dF/dx_t.
   template <class Scatter>
-  PetscErrorCode for_matrices(Part part, PetscReal t, Vec x, Vec x_t, PetscReal shift, const PetscReal row_scale[],
-                              CellMatrices *also, Scatter &&scatter);
+  PetscErrorCode for_matrices(Part part, PetscReal t, Vec x, Vec x_t, PetscReal shift, Scatter &&scatter);
   PetscErrorCode prepare_weighing();
   PetscInt places_per_call() const;
   PetscErrorCode put_places(const std::vector<PetscReal> &rows, const std::string &surface, PetscInt begin);

@@ -89,8 +89,11 @@ public:
     return assembly_.cell_matrices(t, x, x_t, shift, take);
   }
 
+  /// Global numbers of the rows of a field.
+  IS field_rows(FieldIndex field) const { return field_rows_[field]; }
+
   /// Lets each Jacobian hand its element matrices to @p matrices, too, which must outlive the model.
-  void also_fill(CellMatrices &matrices) { also_ = &matrices; }
+  void also_fill(CellMatrices &matrices) { also_.push_back(&matrices); }
 
   PetscErrorCode measure(Vec x, Measures &measures) const { return assembly_.measure(x, measures); }
   PetscErrorCode largest_J_change(Vec x, Vec y, PetscReal &change) const
@@ -184,7 +187,7 @@ private:
   PetscInt quadrature_degree_ = 3;
   bool own_ = true;
   Assembly assembly_;
-  CellMatrices *also_ = nullptr;
+  std::vector<CellMatrices *> also_;
   std::unique_ptr<PointMemory> memory_;
 };
 

@@ -23,7 +23,8 @@ public:
   Mat matrix() const { return matrix_; }
 
   PetscErrorCode begin() override;
-  PetscErrorCode add(PetscInt c, const PetscScalar *matrix, const PetscReal row_scale[]) override;
+  PetscErrorCode add(PetscInt c, ElementOf what, const PetscScalar *matrix, const PetscReal row_scale[],
+                     bool transposed) override;
   PetscErrorCode end(const std::vector<PetscInt> &closed) override;
 
 private:

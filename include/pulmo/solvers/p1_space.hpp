@@ -5,6 +5,7 @@
 #include "pulmo/fem/assembly.hpp"
 #include "pulmo/fem/matrix_map.hpp"
 
+#include <array>
 #include <vector>
 
 namespace pulmo {
@@ -26,14 +27,14 @@ public:
   Mat matrix() const { return matrix_; }
 
   PetscErrorCode begin() override;
-  PetscErrorCode add(PetscInt c, Place place, const PetscScalar *matrix, const PetscReal row_scale[],
+  PetscErrorCode add(PetscInt c, ElementOf what, const PetscScalar *matrix, const PetscReal row_scale[],
                      bool transposed) override;
   PetscErrorCode end(const std::vector<PetscInt> &closed) override;
 
 private:
-  /// A node of a cell takes part in the displacement of a vertex of the cell.
+  /// A node of a cell that follows a vertex of the cell.
   struct Share {
-    PetscInt node, vertex;
+    PetscInt node;
     PetscReal weight;
   };
   static constexpr PetscInt vertices = 4, size = 3 * vertices;
@@ -45,8 +46,8 @@ private:
   MatHandle matrix_;
   CellLayout layout_;
   MatrixMap map_;
-  PetscInt n_u_ = 0, width_ = 0; ///< displacement's dofs of a cell; all of them
-  std::vector<Share> shares_;    ///< the same for all cells, as these see their nodes
+  PetscInt n_u_ = 0, width_ = 0;                    ///< displacement's dofs of a cell; all of them
+  std::array<std::vector<Share>, vertices> shares_; ///< the same for all cells, as these see their nodes
 };
 
 } // namespace pulmo

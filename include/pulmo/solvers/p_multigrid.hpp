@@ -11,4 +11,8 @@ namespace pulmo {
 /// problem). Needs a matrix of the displacement alone, or a DisplacementBlock.
 PetscErrorCode register_p_multigrid();
 
+/// Whether options say that the preconditioner with @p prefix is one that needs no copy of its block
+/// (view_displacement).
+PetscErrorCode reads_in_place(const char *prefix, bool &reads);
+
 } // namespace pulmo

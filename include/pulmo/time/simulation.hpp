@@ -6,8 +6,9 @@
 #include "pulmo/fem/model.hpp"
 #include "pulmo/fem/pins.hpp"
 #include "pulmo/physics/scene.hpp"
+#include "pulmo/solvers/fixed_stress.hpp"
 #include "pulmo/solvers/lagging.hpp"
-#include "pulmo/solvers/preconditioning.hpp"
+#include "pulmo/solvers/p1_space.hpp"
 #include "pulmo/time/airway.hpp"
 #include "pulmo/time/balance.hpp"
 #include "pulmo/time/failure.hpp"
@@ -134,6 +135,7 @@ private:
   /// Ends the run with @p reason if it is asked to stop.
   PetscErrorCode heed_request(TSConvergedReason reason);
   PetscErrorCode offer_fixed_stress(KSP ksp);
+  PetscErrorCode offer_view(KSP ksp);
   /// Two times closer than this share of the step are the same.
   static constexpr PetscReal same_time = 1e-9;
   /// Whether two times of this run are the same up to rounding.
@@ -201,6 +203,7 @@ private:
   PinForces pins_;
   Lagging lagging_;
   FixedStress fixed_stress_;
+  P1Matrix p1_;
   std::vector<Observer *> observers_;
   StopRequest *stop_request_ = nullptr;
   Trajectory *trajectory_ = nullptr;
