@@ -88,8 +88,8 @@ PetscErrorCode Predictor::accept(Vec X)
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Predictor::improve(SNES snes, const std::function<PetscErrorCode(Vec)> &hold, PetscReal slope, Vec X,
-                                  PetscReal &norm)
+PetscErrorCode Predictor::improve(SNES snes, const std::function<PetscErrorCode(Vec)> &hold, PetscReal slope,
+                                  bool trusted, Vec X, PetscReal &norm)
 {
   PetscReal guess_norm;
   PetscInt n = 0;
@@ -101,7 +101,7 @@ PetscErrorCode Predictor::improve(SNES snes, const std::function<PetscErrorCode(
   PetscCall(VecCopy(residual_, foreseen_));
   PetscInt recorded = 0; // not mixed with what is evaluated: secants of two kinds foresee less well
   while (slope > 0 && recorded < known_ && slope_[recorded] == slope) ++recorded;
-  const PetscInt used = recorded > 0 ? recorded : std::min(known_, most_evaluated);
+  const PetscInt used = !trusted ? 0 : recorded > 0 ? recorded : std::min(known_, most_evaluated);
   for (PetscInt i = 0; i < used && std::isfinite(norm); ++i) {
     const Vec d = direction_[n], s = secant_[n];
     PetscReal before, after;
@@ -132,7 +132,7 @@ PetscErrorCode Predictor::improve(SNES snes, const std::function<PetscErrorCode(
     PetscCall(VecAXPY(foreseen_, -along, s));
     ++n;
   }
-  if (known_ == 0 && std::isfinite(norm)) PetscCall(SNESSetInitialFunction(snes, residual_));
+  if (used == 0 && std::isfinite(norm)) PetscCall(SNESSetInitialFunction(snes, residual_));
   if (n == 0) PetscFunctionReturn(PETSC_SUCCESS);
   PetscCall(residual_norm(snes, X, foreseen_, guess_norm));
   PetscCall(PetscInfo(snes, "residual %g at the last state, %g at the guess\n", (double)norm, (double)guess_norm));

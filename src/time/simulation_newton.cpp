@@ -146,7 +146,9 @@ PetscErrorCode Simulation::guess(SNES snes, Vec X)
   const auto hold = [this](Vec increment) { return airway_.hold(increment); };
   // with an opening pressure among the unknowns steps move more than the vector of them says
   const PetscReal slope = airway_.mode() == Airway::Mode::solved ? 0 : scheme_.slope();
-  PetscCall(predictor_.improve(snes, hold, slope, X, start_norm_));
+  // past increments may have led the attempt before this one to where Newton found no way out
+  const bool trusted = failures_.empty() && !lagging_.always_new();
+  PetscCall(predictor_.improve(snes, hold, slope, trusted, X, start_norm_));
   inverted_ = false; // a guess was tried, no more
   PetscFunctionReturn(PETSC_SUCCESS);
 }

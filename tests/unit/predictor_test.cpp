@@ -53,10 +53,10 @@ protected:
   void TearDown() override { PULMO_OK(SNESDestroy(&snes_)); }
 
   static PetscReal direction(int step, PetscInt i) { return 0.1 * (step ? std::cos(0.7 * i) : std::sin(1. + i)); }
-  PetscErrorCode improve(PetscReal slope = 0)
+  PetscErrorCode improve(PetscReal slope = 0, bool trusted = true)
   {
     return predictor_.improve(
-        snes_, [](Vec) { return PetscErrorCode(0); }, slope, x_, norm_);
+        snes_, [](Vec) { return PetscErrorCode(0); }, slope, trusted, x_, norm_);
   }
   /// Solves the linear problem under @p load in place of the step that improve() began.
   void solve(PetscReal load)
@@ -96,6 +96,24 @@ protected:
   Predictor predictor_;
   PetscReal norm_ = 0;
 };
+
+TEST_F(PredictorTest, LeavesTheStateAloneWhereItIsNotTrusted)
+{
+  VecHandle start;
+  PetscBool same;
+  PULMO_OK(VecDuplicate(x_, start.out()));
+  PULMO_OK(VecCopy(x_, start));
+  PetscInt before, after;
+  PULMO_OK(SNESGetNumberFunctionEvals(snes_, &before));
+  PULMO_OK(improve(0, false));
+  PULMO_OK(SNESGetNumberFunctionEvals(snes_, &after));
+  PULMO_OK(VecEqual(x_, start, &same));
+  EXPECT_TRUE(same);
+  EXPECT_EQ(after, before + 1) << "the residual at the start is what tolerances are relative to";
+  PULMO_OK(improve());
+  PULMO_OK(VecEqual(x_, start, &same));
+  EXPECT_FALSE(same) << "the scene has nothing to guess";
+}
 
 TEST_F(PredictorTest, MinimisesTheResidualOverPastIncrements)
 {

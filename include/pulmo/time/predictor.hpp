@@ -28,9 +28,10 @@ public:
   PetscErrorCode accept(Vec X);
   /// Improves @p X, the state that a step starts from with the prescribed values of its end in place, and hands its
   /// residual to @p snes. @p hold zeroes the prescribed values in an increment. @p norm: of the residual at the start.
-  /// @p slope: how the step makes rates of states (Stage), 1/s; 0: secants of other steps are of no use.
-  PetscErrorCode improve(SNES snes, const std::function<PetscErrorCode(Vec)> &hold, PetscReal slope, Vec X,
-                         PetscReal &norm);
+  /// @p slope: how the step makes rates of states (Stage), 1/s; 0: secants of other steps are of no use. @p trusted: if
+  /// not, X remains as it is.
+  PetscErrorCode improve(SNES snes, const std::function<PetscErrorCode(Vec)> &hold, PetscReal slope, bool trusted,
+                         Vec X, PetscReal &norm);
 
 private:
   PetscInt increments_ = 0, known_ = 0; ///< how many to use; how many there are
