@@ -110,6 +110,11 @@ class Solvers(unittest.TestCase):
         for file in ("iterative_hypre.opts", "iterative_ml.opts"):
             self.assertEqual(options(file), options("iterative.opts"), file)
 
+        def but_for_the_displacement(file):
+            return [line for line in options(file) if not line.startswith("-fieldsplit_displacement_")]
+
+        self.assertEqual(but_for_the_displacement("iterative_flat.opts"), but_for_the_displacement("iterative.opts"))
+
 
 if __name__ == "__main__":
     pc.main()

@@ -9,6 +9,7 @@ from .laws import inflated
 
 REUSE = pulmo.options_file("solvers/reuse.opts")
 ITERATIVE = pulmo.options_file("solvers/iterative.opts")
+ITERATIVE_FLAT = pulmo.options_file("solvers/iterative_flat.opts")
 # bytes that a step leaves in memory: SignalRow, EnergyBalance with six accounts, and RegionState with one region (vectors of their own)
 ROW = 152 + (48 + 64) + (24 + 48)
 
