@@ -179,10 +179,13 @@ bool linear_solver_failed(const FailureFacts &facts)
   return !facts.attempts.empty() && facts.attempts.back().reason.find("LINEAR") != std::string::npos;
 }
 
-/// Whether the last attempt was solved, but changed J by more than a step may.
-bool bound_too_low(const FailureFacts &facts)
+/// The option that bounds the changes of a step, if the last attempt was solved but changed more
+/// (StepBound::complaint); else empty.
+std::string low_bound(const FailureFacts &facts)
 {
-  return !facts.attempts.empty() && facts.attempts.back().reason.rfind(J_change_bound, 0) == 0;
+  if (facts.attempts.empty()) return "";
+  const std::string &reason = facts.attempts.back().reason;
+  return reason.rfind("-step_", 0) == 0 ? reason.substr(0, reason.find(':')) : "";
 }
 
 /// What the diagnosis says, in a sentence that begins with a blank.
@@ -219,7 +222,8 @@ std::string why(const Scene &scene, const FailureFacts &facts, const Diagnosis &
     break;
   case Diagnosis::Kind::solver:
     text << " Where: in the solver. "
-         << (bound_too_low(facts)          ? "The bound of -step_J_change asks for shorter steps than there may be"
+         << (!low_bound(facts).empty()
+                 ? "The bound of " + low_bound(facts) + " asks for shorter steps than there may be"
              : linear_solver_failed(facts) ? "The linear solver failed"
                                            : "Newton's method stalled")
          << " while no cell of the last step is near turning inside out (least J = " << facts.rows.back().min_J
@@ -246,8 +250,8 @@ std::string what_to_try(const Scene &scene, const FailureFacts &facts, const Dia
   case Diagnosis::Kind::solver:
     break;
   }
-  if (bound_too_low(facts))
-    return "a larger -step_J_change, a smaller -ts_adapt_dt_min, a slower rise or fall of pressure or flow.";
+  if (const std::string bound = low_bound(facts); !bound.empty())
+    return "a larger " + bound + ", a smaller -ts_adapt_dt_min, a slower rise or fall of pressure or flow.";
   return std::string(scene.facts().surface_pressures_by.empty()
                          ? ""
                          : "the sizes and resistances of -" + scene.facts().surface_pressures_by +

@@ -232,6 +232,12 @@ PetscErrorCode Simulation::create_solver()
   PulmoUserCheck(!limits_steps || step_control_.in_use(), comm,
                  "-ts_adapt_dt_max: steps do not grow beyond -ts_dt unless their error chooses them; lower -ts_dt, or "
                  "give -step_volume_tolerance and -step_pressure_tolerance");
+  for (const StepBound &bound : step_control_.bounds())
+    PulmoUserCheck(
+        !bound.in_use() || bound.quantity != StepBound::Quantity::pressure || scene_.facts().airflow ||
+            scene_.facts().ventilator,
+        comm, "%s: this scene has no gas whose pressure could change; add -airflow or a -ventilator, or leave it out",
+        bound.option);
   if (adapt->dt_min > wanted_dt_)
     PetscCall(PetscPrintf(comm,
                           "pulmo: warning: -ts_adapt_dt_min %g s is longer than -ts_dt %g s: no step can be cut, and "

@@ -27,8 +27,8 @@ constexpr PetscReal rounding = 1e-13;
 /// Steps in which pressure spreads over so many cells' squares leave gas that is large beside what moves.
 constexpr PetscReal fast_gas = 1e4;
 
-/// A step that changed J by too much is cut to this share of itself at least, and at most.
-constexpr PetscReal least_J_cut = 0.1, largest_J_cut = 0.9;
+/// A step that changed a bounded quantity by too much is cut to this share of itself at least, and at most.
+constexpr PetscReal least_bound_cut = 0.1, largest_bound_cut = 0.9;
 
 /// Failed attempts that are remembered.
 constexpr std::size_t max_failures = 12;
@@ -37,9 +37,8 @@ constexpr std::size_t max_failures = 12;
 
 PetscReal Simulation::next_step(PetscReal t, PetscReal h, TSAdapt adapt, PetscBool &accept)
 {
-  // the step after this one must not change J by too much either, if that goes on as it did
-  const PetscReal longest =
-      step_control_.J_change() > 0 ? h * step_control_.length_within_J_change(J_change_) : PETSC_MAX_REAL;
+  // the step after this one must not change a bounded quantity by too much either, if that goes on as it did
+  const PetscReal longest = h * step_control_.tightest().length_within();
   accept = PETSC_TRUE;
   if (!step_control_.in_use()) {
     if (cut_)
@@ -181,7 +180,7 @@ PetscErrorCode Simulation::accept_stage(PetscReal t, Vec X, PetscBool *accept)
   PetscCall(airway_.pressure(local_, attempt.pressure));
   attempt.flow = airway_.opening_flow(scheme_.flow(measures.volume_change));
   PetscCall(ask_partners(attempt, accept));
-  if (*accept && step_control_.J_change() > 0) PetscCall(judge_J_change(dt, accept));
+  if (*accept) PetscCall(judge_changes(attempt, accept));
   if (!*accept) PetscFunctionReturn(PETSC_SUCCESS);
   bool solved;
   candidate_ = {t, measures.volume_change / units::mm3_per_ml, attempt.pressure / units::kPa_per_cmH2O};
@@ -223,19 +222,31 @@ PetscErrorCode Simulation::ask_partners(const Attempt &attempt, PetscBool *accep
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Simulation::judge_J_change(PetscReal dt, PetscBool *accept)
+PetscErrorCode Simulation::measure_change(const Attempt &attempt, StepBound::Quantity quantity, PetscReal &change) const
 {
-  const PetscReal bound = step_control_.J_change();
-  std::ostringstream why;
-
   PetscFunctionBeginUser;
-  PetscCall(model_.largest_J_change(before_, local_, J_change_));
-  if (J_change_ <= bound) PetscFunctionReturn(PETSC_SUCCESS);
+  if (quantity == StepBound::Quantity::log_J)
+    PetscCall(model_.largest_J_change(before_, attempt.local, change));
+  else {
+    if (scene_.facts().airflow)
+      PetscCall(model_.largest_pressure_change(before_, attempt.local, change));
+    else
+      change = std::abs(attempt.pressure - accepted_.pressure * units::kPa_per_cmH2O);
+    change /= units::kPa_per_cmH2O;
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Simulation::judge_changes(const Attempt &attempt, PetscBool *accept)
+{
+  PetscFunctionBeginUser;
+  for (StepBound &bound : step_control_.bounds())
+    if (bound.in_use()) PetscCall(measure_change(attempt, bound.quantity, bound.change));
+  const StepBound &tightest = step_control_.tightest();
+  if (tightest.met()) PetscFunctionReturn(PETSC_SUCCESS);
   *accept = PETSC_FALSE;
-  why << J_change_bound << ": |ln J| changed by " << J_change_ << ", " << bound << " at most";
-  const PetscReal share =
-      std::clamp<PetscReal>(step_control_.length_within_J_change(J_change_), least_J_cut, largest_J_cut);
-  PetscCall(reject(dt, why.str(), 0, Measures(), false, share));
+  const PetscReal share = std::clamp<PetscReal>(tightest.length_within(), least_bound_cut, largest_bound_cut);
+  PetscCall(reject(attempt.dt, tightest.complaint(), 0, Measures(), false, share));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

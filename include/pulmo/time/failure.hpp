@@ -14,9 +14,6 @@
 
 namespace pulmo {
 
-/// What the reason of an attempt begins with that changed J by too much.
-inline constexpr const char *J_change_bound = "-step_J_change";
-
 /// An attempt at a step that was not accepted.
 struct FailedAttempt {
   PetscReal time = 0, dt = 0; ///< where the step began and how long it was, s
