@@ -184,7 +184,7 @@ PetscErrorCode Simulation::create_solver()
   PetscBool tests_jacobian;
   PetscCall(PetscOptionsHasName(nullptr, nullptr, "-snes_test_jacobian", &tests_jacobian));
   tests_jacobian_ = tests_jacobian;
-  if (lagging_.in_use() || predictor_.in_use() ||
+  if (lagging_.in_use() || predictor_.in_use() || scene_.facts().flow_past_limit_points ||
       (scene_.facts().ventilator && scene_.facts().ventilator->prescribes_flow()))
     PetscCall(SNESSetConvergenceTest(snes, newton_converged, this, nullptr));
   if (scene_.facts().unknown_opening_pressure()) {
@@ -196,8 +196,9 @@ PetscErrorCode Simulation::create_solver()
     PetscBool newton;
     SNESType type;
     const SceneFacts &facts = scene_.facts();
-    const bool limits = facts.ventilator->limits_pressure(),
-               split = facts.airflow && !facts.tube && !limits && facts.surface_pressures_by.empty();
+    const bool limits = facts.ventilator->limits_pressure(), split = facts.airflow && !facts.tube && !limits &&
+                                                                     !facts.flow_past_limit_points &&
+                                                                     facts.surface_pressures_by.empty();
     PetscCall(PetscObjectTypeCompare((PetscObject)snes, SNESNEWTONLS, &newton));
     PetscCall(SNESGetType(snes, &type));
     PulmoUserCheck(
@@ -208,6 +209,7 @@ PetscErrorCode Simulation::create_solver()
         !facts.surface_pressures_by.empty() ? ("-" + facts.surface_pressures_by).c_str()
         : facts.tube                        ? "-tube"
         : limits                            ? "a limit of pressure"
+        : facts.flow_past_limit_points      ? "-ventilator_on_limit_point flow"
         : split                             ? "-ventilator_flow_split common_pressure"
                                             : "a flow into a lung with -airflow off",
         split ? ", or -ventilator_flow_split uniform" : "");

@@ -214,7 +214,7 @@ PetscErrorCode Simulation::ask_partners(const Attempt &attempt, PetscBool *accep
   *accept = PetscBool(verdict <= Verdict::kink);
   kink_ = verdict == Verdict::kink;
   if (verdict == Verdict::again) {
-    went("again, with the limit of the phase held");
+    went("again, " + why);
     for (Partner *partner : partners_) partner->reject(verdict);
     PetscCall(keep_step(attempt.dt));
   }
@@ -266,6 +266,7 @@ AttemptBegin Simulation::next_attempt() const
   begin.always_new = lagging_.always_new();
   begin.looks_back = scheme_.looks_back();
   begin.limited = airway_.retakes();
+  begin.past_limit = airway_.past_limit();
   begin.crawled = crawled_;
   begin.failures = failures_;
   return begin;
@@ -409,9 +410,42 @@ PetscErrorCode Simulation::reject(PetscReal dt, const std::string &reason, Petsc
   PetscCall(TSGetAdapt(ts_, &adapt));
   const PetscReal next = dt * share.value_or(adapt->scale_solve_failed);
   if (share) PetscCall(TSSetTimeStep(ts_, next / adapt->scale_solve_failed)); // PETSc cuts it
-  if (next < std::max(adapt->dt_min, least_step * asked_dt()))
+  if (next < std::max(adapt->dt_min, least_step * asked_dt())) {
+    bool flows_on;
+    PetscCall(flow_on(flows_on));
+    if (flows_on) {
+      PetscCall(keep_step(landing(accepted_.time)));
+      PetscFunctionReturn(PETSC_SUCCESS);
+    }
     PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
+  }
   PetscCall(heed_request(TS_DIVERGED_STEP_REJECTED));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Simulation::flow_on(bool &flows_on)
+{
+  Measures last;
+
+  PetscFunctionBeginUser;
+  flows_on = false;
+  if (!scene_.facts().flow_past_limit_points) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(model_.measure(before_, last));
+  const auto limit = limit_point(rows_, last);
+  flows_on = limit && airway_.flow_on();
+  if (!flows_on) PetscFunctionReturn(PETSC_SUCCESS);
+  cut_ = false;
+  crawled_ = 0;
+  failures_.clear();
+  dt_ = asked_dt();
+  begin_smooth_stretch();
+  PetscCall(PetscPrintf(options_.comm(),
+                        "pulmo: note: a limit point at t = %.6g s (phase '%s'): at %.6g ml there is no equilibrium %s "
+                        "%.6g cmH2O; from there on a flow of %.4g ml/s is prescribed, until the pressure of the phase "
+                        "can be held again\n",
+                        (double)accepted_.time, phase_->name.c_str(), accepted_.volume,
+                        limit->highest ? "above" : "below", limit->pressure,
+                        (double)(airway_.flow_past_limit() / units::mm3_per_ml)));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -476,6 +510,7 @@ PetscErrorCode Simulation::after_step()
   list_scalars(row);
   row.phase = phase_->name;
   row.hold = airway_.holds_volume();
+  row.past_limit = airway_.flows();
   row.breath = static_cast<int>(phase_->breath);
   row.newton = newton_;
   row.krylov = krylov_;
@@ -488,11 +523,22 @@ PetscErrorCode Simulation::after_step()
   PetscCall(scheme_.accept(model_, moment(t, measures.volume_change, local_)));
   step_control_.accept({t, row.volume, row.pressure});
   balance_.accept();
+  if (accepted_.past_limit && airway_.holds_phase())
+    PetscCall(PetscPrintf(options_.comm(),
+                          "pulmo: note: from t = %.6g s and %.6g ml on (phase '%s') the pressure of the phase is held "
+                          "again\n",
+                          (double)accepted_.time, accepted_.volume, phase_->name.c_str()));
   accepted_ = row;
-  if (kink) {
+  bool flows_on = false;
+  if (crawls()) { // at a limit point steps may do so
+    rows_.push_back(row);
+    PetscCall(flow_on(flows_on));
+    rows_.pop_back();
+  }
+  if (kink || flows_on) {
     begin_smooth_stretch();
     PetscCall(TSRestartStep(ts_));
-    if (step_control_.in_use()) PetscCall(TSSetTimeStep(ts_, landing(t)));
+    if (step_control_.in_use() || flows_on) PetscCall(TSSetTimeStep(ts_, landing(t)));
     PetscCall(TSGetTimeStep(ts_, &next_dt_));
   }
   PetscCall(report(row, measures));
@@ -565,7 +611,8 @@ FailureFacts Simulation::failure_facts() const
   facts.rows = rows_;
   facts.crawled = crawls();
   facts.free_flow = airway_.mode() == Airway::Mode::free;
-  facts.prescribes_pressure = phase_ && phase_->control == Control::pressure;
+  facts.prescribes_pressure = phase_ && phase_->control == Control::pressure && !airway_.past_limit();
+  facts.may_flow_on = scene_.facts().flow_past_limit_points.has_value();
   if (phase_) facts.phase = phase_->name;
   return facts;
 }

@@ -175,6 +175,9 @@ private:
   /// if that is more.
   PetscErrorCode judge_changes(const Attempt &attempt, PetscBool *accept);
   PetscErrorCode measure_change(const Attempt &attempt, StepBound::Quantity quantity, PetscReal &change) const;
+  /// Lets the run go on past the limit point that its last accepted state is at, if there is one and the scene asks for
+  /// that; whether it does.
+  PetscErrorCode flow_on(bool &flows_on);
   PetscErrorCode report(SignalRow row, const Measures &measures);
   /// Lays out the phases again, those that ended early as long as they were.
   void lay_out_phases();
