@@ -401,6 +401,10 @@ std::string failure_text(const Scene &scene, const FailureFacts &facts, const Di
       first += "-ventilator_flow_split common_pressure, ";
     }
   }
+  if (facts.past_limit) {
+    text << " A flow is prescribed here, past a limit point of the pressure (-ventilator_on_limit_point).";
+    first += "another -ventilator_limit_point_flow, ";
+  }
   text << " What to try: " << first << what_to_try(scene, facts, d);
   return text.str();
 }

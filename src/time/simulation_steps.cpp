@@ -612,6 +612,7 @@ FailureFacts Simulation::failure_facts() const
   facts.crawled = crawls();
   facts.free_flow = airway_.mode() == Airway::Mode::free;
   facts.prescribes_pressure = phase_ && phase_->control == Control::pressure && !airway_.past_limit();
+  facts.past_limit = airway_.past_limit();
   facts.may_flow_on = scene_.facts().flow_past_limit_points.has_value();
   if (phase_) facts.phase = phase_->name;
   return facts;
