@@ -51,7 +51,7 @@ Json static_curve(const std::vector<SignalRow> &rows)
   return curve;
 }
 
-/// The ways on past limit points, each until the pressure of the phase was held again or a phase prescribed a flow.
+/// The ways on past limit points, each until a prescribed pressure was held again or the run ended.
 Json limit_points(const std::vector<SignalRow> &rows)
 {
   Json list = Json::array();

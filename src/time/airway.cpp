@@ -18,9 +18,8 @@ constexpr PetscReal volume_tolerance = 1e-10;
 void Airway::begin_phase(const Phase &phase, PetscReal volume, PetscReal first_step)
 {
   phase_ = phase;
-  past_limit_ = past_limit_ && phase_.control == Control::pressure;
-  // what the phase before was to end at was not reached
-  starts_from_before_ = !phase_.from || past_limit_;
+  // past a limit point the phase before did not reach what it was to end at
+  starts_from_before_ = !phase_.from || (past_limit_ && phase_.control == Control::pressure);
   if (starts_from_before_) phase_.from = ventilator_before_;
   volume_begin_ = volume_before_ = volume + scalars_.stored(before_);
   time_before_ = phase_.begin;
@@ -116,7 +115,7 @@ Airway::Condition Airway::condition() const
 void Airway::begin(PetscReal t, PetscReal step_end)
 {
   limited_ = phase_.control == Control::flow && (limited_before_ || retake_);
-  flows_ = past_limit_ && !retake_;
+  flows_ = phase_.control == Control::pressure && past_limit_ && !retake_;
   exceeds_ = false;
   retake_ = retake_ && scheme_.half_step(); // the whole step that follows belongs to the same attempt
   set_mode();
@@ -241,7 +240,7 @@ Verdict Airway::judge(const Attempt &attempt)
   else
     exceeds_ = !limited_ && phase_.limit && pressure > *phase_.limit;
   if (exceeds_) return Verdict::again;
-  return limited_ != limited_before_ || flows_ != past_limit_ ? Verdict::kink : Verdict::accept;
+  return limited_ != limited_before_ || returns() ? Verdict::kink : Verdict::accept;
 }
 
 void Airway::accept(const Attempt &attempt)
@@ -250,7 +249,7 @@ void Airway::accept(const Attempt &attempt)
   before_.front() = pressure_;
   ventilator_before_ = ventilator_pressure(attempt.flow);
   limited_before_ = limited_;
-  past_limit_ = flows_;
+  past_limit_ = past_limit_ && !returns(); // a phase that prescribes a flow may be in between
   time_before_ = attempt.time;
   volume_before_ = attempt.volume + scalars_.stored(scalars_.values());
   highest_flow_ = std::max(highest_flow_, attempt.flow);

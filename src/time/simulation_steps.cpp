@@ -497,6 +497,7 @@ PetscErrorCode Simulation::after_step()
   PetscCall(record_stage(t, static_cast<PetscInt>(rows_.size()), local_));
   const PetscReal opening_flow = airway_.opening_flow(row.flow * units::mm3_per_ml);
   const Attempt accepted{t, row.dt, measures.volume_change, pressure, opening_flow, local_};
+  const bool was_past_limit = airway_.past_limit();
   for (Partner *partner : partners_) partner->accept(accepted);
   // -ts_max_time may end the phase at hand where it ends by itself
   const auto index = static_cast<std::size_t>(phase_ - phases_.data());
@@ -510,7 +511,7 @@ PetscErrorCode Simulation::after_step()
   list_scalars(row);
   row.phase = phase_->name;
   row.hold = airway_.holds_volume();
-  row.past_limit = airway_.flows();
+  row.past_limit = airway_.past_limit();
   row.breath = static_cast<int>(phase_->breath);
   row.newton = newton_;
   row.krylov = krylov_;
@@ -523,7 +524,7 @@ PetscErrorCode Simulation::after_step()
   PetscCall(scheme_.accept(model_, moment(t, measures.volume_change, local_)));
   step_control_.accept({t, row.volume, row.pressure});
   balance_.accept();
-  if (accepted_.past_limit && airway_.holds_phase())
+  if (was_past_limit && !airway_.past_limit())
     PetscCall(PetscPrintf(options_.comm(),
                           "pulmo: note: from t = %.6g s and %.6g ml on (phase '%s') the pressure of the phase is held "
                           "again\n",

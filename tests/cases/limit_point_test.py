@@ -125,6 +125,22 @@ class LimitPoint(unittest.TestCase):
         self.assertAlmostEqual(down["pressure_cmH2O"], extreme(soft_birzle, 3, 8, -1)[1], delta=2e-3)
         self.assertEqual(far.signals()["volume_ml"].max().round(3), rows["volume_ml"].max().round(3))
 
+    def test_a_phase_of_flow_in_between(self):
+        """What follows a phase that prescribes a flow past the limit point is let out over the fold, too: with the pressure prescribed
+        the volume would grow as that falls."""
+        case = pulmo.finished(FREE + ["-tissue", "yoshihara", "-ts_dt", "0.05"] + FLOW + pulmo.programme(
+            "inflation 1 pressure 20 ramp 1\nmore 0.3 flow 500\nhold 0.2 hold\nout 1.5 pressure 3 ramp 0.5\n"))
+        rows, J, past = self.expect_on_the_curve(case, cm4)
+        phase, V, p = np.array(rows["phase"]), rows["volume_ml"], rows["airway_pressure_cmH2O"]
+        top = V[phase == "inflation"][-1]
+        np.testing.assert_allclose(V[phase == "hold"], top + 150, rtol=1e-9)
+        self.assertTrue((np.diff(V[phase == "out"]) < 1e-6).all())
+        self.assertTrue(past[(phase == "more") | (phase == "hold")].all())
+        self.assertAlmostEqual(p[-1], 3, places=6)
+        self.assertAlmostEqual(J[-1], brentq(lambda J: cm4(J) - 3, 1, 2), places=6)
+        point, = case.json()["limit_points"]
+        self.assertEqual((point["phase"], point["end_phase"]), ("inflation", "out"))
+
     def test_on_springs(self):
         """Springs along the normal of three faces: F = J^(1/3) I still, and they add K L (J^(1/3) - 1) / J^(2/3) to the pressure."""
         def law(J, K=2e-3, L=100):
@@ -203,11 +219,16 @@ class LimitPoint(unittest.TestCase):
         self.assertIn("What to try: another -ventilator_limit_point_flow", case.err)
 
     def test_error_bars_come_from_more_runs(self):
+        """And they hold: the limit point and the flow from there on have closed forms."""
         scene = CM4 + FLOW + ["-dm_plex_filename", pulmo.mesh("cube_coarse.msh"), "-ventilator_pip", "17.5", "-ts_dt", "0.01"]
         report = pulmo.finished(scene + ["-error_estimate"], timeout=600).json()["error_estimate"]
         self.assertEqual(report["method"], "runs")
-        peak = report["numbers"]["peak_inspiratory_pressure_cmH2O"]
-        self.assertLess(abs(peak["value"] - extreme(cm4, 1, 6, 1)[1]), 1e-2)
+        J_top, p_top = extreme(cm4, 1, 6, 1)
+        exact = {"peak_inspiratory_pressure_cmH2O": p_top, "tidal_volume_ml": 1000 * (J_top - 1) / (p_top / 17.5)}  # by the mean flow
+        for name, value in exact.items():
+            number = report["numbers"][name]
+            self.assertLess(abs(number["value"] - value), number["error"], name)
+            self.assertLess(number["error"], 0.02 * value, name)
 
     def test_what_is_refused(self):
         def refused(options, *words):

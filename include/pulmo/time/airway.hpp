@@ -53,10 +53,7 @@ public:
   {
     return flows_ ? "with the pressure of the phase held" : "with the limit of the phase held";
   }
-  void reject(Verdict how) override
-  {
-    retake_ = how == Verdict::again && (limited_ || (past_limit_ && !flows_) || exceeds_);
-  }
+  void reject(Verdict how) override { retake_ = how == Verdict::again && (limited_ || returns() || exceeds_); }
   void accept(const Attempt &attempt) override;
   /// What a step needs of the phase and of the steps before it; the phase was begun.
   PetscErrorCode past(Past &past) override;
@@ -70,10 +67,6 @@ public:
   /// Whether steps that begin now are past a limit point; and makes it so.
   bool past_limit() const { return past_limit_; }
   void past_limit(bool past) { past_limit_ = past; }
-  /// Whether the step at hand has a flow prescribed that the phase does not.
-  bool flows() const { return flows_; }
-  /// Whether the step at hand prescribes a pressure that the phase does.
-  bool holds_phase() const { return phase_.control == Control::pressure && !flows_; }
   /// Whether the next attempt is to hold the pressure that was met (the limit of the phase, or past a limit point what
   /// the phase prescribes), as the one before it asked; and makes it so.
   bool retakes() const { return retake_; }
@@ -146,6 +139,8 @@ public:
   PetscReal flow() const { return scheme_.flow(volume_target_); }
 
 private:
+  /// Whether the step at hand holds the pressure of the phase for the first time since a limit point.
+  bool returns() const { return phase_.control == Control::pressure && past_limit_ && !flows_; }
   /// What the phase prescribes: after its limit was reached a pressure, past a limit point a flow.
   Control control() const { return limited_ ? Control::pressure : flows_ ? Control::flow : phase_.control; }
   void set_mode();
