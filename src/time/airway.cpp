@@ -252,6 +252,8 @@ void Airway::accept(const Attempt &attempt)
   past_limit_ = past_limit_ && !returns(); // a phase that prescribes a flow may be in between
   time_before_ = attempt.time;
   volume_before_ = attempt.volume + scalars_.stored(scalars_.values());
+  over_ = false;
+  if (flows_) return; // what is prescribed tells nothing of the patient
   highest_flow_ = std::max(highest_flow_, attempt.flow);
   highest_pressure_ = std::max(highest_pressure_, ventilator_before_);
   over_ = (phase_.trigger_flow && attempt.flow > *phase_.trigger_flow) ||

@@ -141,6 +141,16 @@ class LimitPoint(unittest.TestCase):
         point, = case.json()["limit_points"]
         self.assertEqual((point["phase"], point["end_phase"]), ("inflation", "out"))
 
+    def test_its_flow_ends_no_phase(self):
+        """It is less than any share of what flowed just before the limit point, where there is no bound to the flow."""
+        case = pulmo.finished(FREE + ["-tissue", "yoshihara", "-ts_dt", "0.05", "-ventilator_limit_point_flow", "1000"] + FLOW + pulmo.programme(
+            "inspiration 1 pressure 20 ramp 1 cycle 25\nexpiration 2 pressure 0 ramp 0.5\n"))
+        rows, _, past = self.expect_on_the_curve(case, cm4)
+        t, phase = rows["time_s"], np.array(rows["phase"])
+        self.assertTrue(past[phase == "inspiration"].any())
+        self.assertAlmostEqual(t[phase == "inspiration"][-1], 1, places=9)
+        self.assertLess(1000, 0.25 * rows["flow_ml_per_s"].max())
+
     def test_on_springs(self):
         """Springs along the normal of three faces: F = J^(1/3) I still, and they add K L (J^(1/3) - 1) / J^(2/3) to the pressure."""
         def law(J, K=2e-3, L=100):
@@ -229,6 +239,13 @@ class LimitPoint(unittest.TestCase):
             number = report["numbers"][name]
             self.assertLess(abs(number["value"] - value), number["error"], name)
             self.assertLess(number["error"], 0.02 * value, name)
+
+    def test_the_scene_in_words(self):
+        for more, words in (([], "the mean flow of the phase until then is prescribed."), (FAST, "a flow of 2e+04 ml/s is prescribed.")):
+            case = pulmo.Case(CM4 + FLOW + more + ["-scene_view_only"])
+            self.assertEqual(case.code, 0, case.tail())
+            self.assertIn("past a limit point, " + words, " ".join(case.out.split()))
+        self.assertNotIn("past a limit point", pulmo.Case(CM4 + ["-scene_view_only"]).out)
 
     def test_what_is_refused(self):
         def refused(options, *words):
