@@ -237,7 +237,7 @@ std::string what_to_try(const Scene &scene, const FailureFacts &facts, const Dia
            "a finer mesh there, a slower rise or fall of pressure or flow, another -tissue.";
   case Diagnosis::Kind::everywhere:
     return std::string("less pressure or volume, ") +
-           (d.limit.empty() || facts.may_flow_on ? "" : "-ventilator_on_limit_point flow, or ") +
+           (facts.could_flow_on && !d.limit.empty() ? "-ventilator_on_limit_point flow, or " : "") +
            "prescribed flow (-ventilator vcv), which goes on beyond a limit point of the pressure, more that holds the "
            "lung (-chest_wall), another -tissue.";
   case Diagnosis::Kind::inside:

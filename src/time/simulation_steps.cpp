@@ -614,7 +614,10 @@ FailureFacts Simulation::failure_facts() const
   facts.free_flow = airway_.mode() == Airway::Mode::free;
   facts.prescribes_pressure = phase_ && phase_->control == Control::pressure && !airway_.past_limit();
   facts.past_limit = airway_.past_limit();
-  facts.may_flow_on = scene_.facts().flow_past_limit_points.has_value();
+  const Programme *ventilator =
+      scene_.facts().ventilator.get(); // pcv prescribes no flow, phases of vcv are from no file
+  facts.could_flow_on = ventilator && !scene_.facts().flow_past_limit_points &&
+                        (!ventilator->prescribes_flow() || (phase_ && !phase_->where.empty()));
   if (phase_) facts.phase = phase_->name;
   return facts;
 }

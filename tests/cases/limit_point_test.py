@@ -109,6 +109,7 @@ class LimitPoint(unittest.TestCase):
             # the branches far from the folds
             self.assertAlmostEqual(J.max(), brentq(lambda J: soft_birzle(J) - 6, 4.9, 20), places=5)
             self.assertAlmostEqual(V[-1], 0, places=6)
+            self.assertLess(abs(case.json()["energy_j"]["residual"]), 1e-8)
             self.assertIn("there is no equilibrium above 4.98", case.out)
             self.assertIn("there is no equilibrium below 4.51", case.out)
 

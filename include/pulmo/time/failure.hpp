@@ -64,7 +64,7 @@ struct FailureFacts {
   bool crawled = false;                ///< it ended because steps only crawled
   bool free_flow = false;              ///< in a phase that shares a prescribed flow by area
   bool prescribes_pressure = false;    ///< as its phase does
-  bool may_flow_on = false;            ///< -ventilator_on_limit_point flow
+  bool could_flow_on = false;          ///< -ventilator_on_limit_point could be flow, and is not
   bool past_limit = false;             ///< a flow is prescribed past a limit point
   std::string phase = "run";
 };

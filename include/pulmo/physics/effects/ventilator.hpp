@@ -111,7 +111,7 @@ public:
     options.group(name(), "flow past limit points", pressures && on_limit_point_ == "flow",
                   "-ventilator_on_limit_point flow");
     PetscCall(options.real("limit_point_flow", "ml/s", Range::not_negative(),
-                           "size of that flow (0: of the mean flow of the phase up to there)", limit_point_flow_));
+                           "size of that flow (0: the mean flow of the phase up to there)", limit_point_flow_));
 
     PetscCall(check_settings(options));
     if (mode_ == "programme") {
