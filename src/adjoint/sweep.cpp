@@ -25,6 +25,8 @@ std::string Sweep::obstacle(const Scene &scene, const Model &model)
   const Composition &composition = model.composition();
   if (!model.own_integration()) return "needs pulmo's own integration: leave -petscfe_type out";
   if (const std::string of_memory = MemorySweep::obstacle(composition); !of_memory.empty()) return of_memory;
+  if (scene.facts().flow_past_limit_points)
+    return "knows no change from prescribed pressure to prescribed flow: leave -ventilator_on_limit_point out";
   if (!scene.facts().ventilator) return "is about the numbers of a breath: it needs -ventilator";
   return "";
 }

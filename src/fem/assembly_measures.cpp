@@ -142,6 +142,24 @@ PetscErrorCode Assembly::largest_J_change(Vec x, Vec y, PetscReal &change) const
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode Assembly::largest_pressure_change(Vec x, Vec y, PetscReal &change) const
+{
+  PetscFunctionBeginUser;
+  change = 0;
+  {
+    const ReadArray xs(x), ys(y);
+    for (PetscInt i = 0; i < layout_.size; ++i) {
+      if (layout_.field_of[i] != pressure) continue;
+      for (PetscInt c = 0; c < layout_.cells; ++c) {
+        const PetscInt dof = cell_dofs(c)[i];
+        change = std::max(change, std::abs(ys[dof] - xs[dof]));
+      }
+    }
+  }
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &change, 1, MPIU_REAL, MPIU_MAX, PetscObjectComm((PetscObject)dm_)));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 PetscErrorCode Assembly::volume_derivative(Vec x, Vec y, PetscReal &derivative) const
 {
   PetscFunctionBeginUser;

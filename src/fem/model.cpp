@@ -256,8 +256,8 @@ PetscErrorCode Model::create_section()
   if (composition().common_gas_pressure()) {
     PulmoUserCheck(
         own_, PetscObjectComm((PetscObject)(DM)dm_),
-        "-petscfe_type basic cannot carry the unknown gas pressure of a flow phase or a tube without -airflow; use the "
-        "default, pulmo");
+        "-petscfe_type basic cannot carry the unknown gas pressure of a flow phase, of a tube or past a limit point "
+        "without -airflow; use the default, pulmo");
     PetscCall(airway_.add_rows(dm_, 1, components[displacement], section));
   }
   PetscCall(add_symmetries(section));

@@ -51,6 +51,11 @@ bool Programme::prescribes_flow() const
   return std::any_of(phases_.begin(), phases_.end(), [](const Phase &p) { return p.control == Control::flow; });
 }
 
+bool Programme::prescribes_pressure() const
+{
+  return std::any_of(phases_.begin(), phases_.end(), [](const Phase &p) { return p.control == Control::pressure; });
+}
+
 bool Programme::limits_pressure() const
 {
   return std::any_of(phases_.begin(), phases_.end(), [](const Phase &p) { return p.limit.has_value(); });

@@ -48,7 +48,8 @@ constexpr std::array<const char *, 22> aside{"-mesh",
                                              "-scene",
                                              "-sensitivities",
                                              "-sweep"};
-constexpr const char *flow_split = "-ventilator_flow_split"; // no part of the programme
+// no part of the programme
+constexpr const char *flow_split = "-ventilator_flow_split", *on_limit_point = "-ventilator_on_limit_point";
 
 template <class List>
 bool begins_with_one_of(const List &prefixes, const std::string &option)
@@ -61,7 +62,7 @@ bool begins_with_one_of(const List &prefixes, const std::string &option)
 
 bool is_free(const std::string &option)
 {
-  return option != flow_split && begins_with_one_of(free_prefixes, option);
+  return option != flow_split && option != on_limit_point && begins_with_one_of(free_prefixes, option);
 }
 
 std::optional<std::string> value_in(const OptionList &list, const std::string &name)
@@ -267,7 +268,11 @@ PetscErrorCode Checkpoint::persist_scene(Archive &archive)
                  named_.c_str(), mesh.c_str(), order_.identity().c_str());
   PetscCall(persist_names(archive));
   OptionList own = options_.by_content(options_.own_used());
-  own.erase(std::remove_if(own.begin(), own.end(), [](const auto &o) { return is_free(o.first); }), own.end());
+  // the next phases may be of a mode that has no such option
+  const auto may_change = [](const auto &o) {
+    return is_free(o.first) || (o.first == on_limit_point && o.second == "stop");
+  };
+  own.erase(std::remove_if(own.begin(), own.end(), may_change), own.end());
   options = text_of(own);
   PetscCall(archive.text("options", options));
   if (archive.reading()) PetscCall(compare_options(options));

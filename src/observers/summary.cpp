@@ -51,6 +51,27 @@ Json static_curve(const std::vector<SignalRow> &rows)
   return curve;
 }
 
+/// The ways on past limit points, each until a prescribed pressure was held again or the run ended.
+Json limit_points(const std::vector<SignalRow> &rows)
+{
+  Json list = Json::array();
+  for (std::size_t i = 1; i < rows.size(); ++i) {
+    if (!rows[i].past_limit || rows[i - 1].past_limit) continue;
+    std::size_t last = i;
+    while (last + 1 < rows.size() && rows[last + 1].past_limit) ++last;
+    const SignalRow &begin = rows[i - 1];
+    list.push_back({{"phase", rows[i].phase},
+                    {"time_s", begin.time},
+                    {"volume_ml", begin.volume},
+                    {"pressure_cmH2O", begin.machine_pressure()},
+                    {"flow_ml_per_s", std::abs(rows[i].volume - begin.volume) / rows[i].dt},
+                    {"end_s", rows[last].time},
+                    {"end_volume_ml", rows[last].volume},
+                    {"end_phase", rows[last].phase}});
+  }
+  return list;
+}
+
 /// Rows of the balance with their signs as listed.
 Json energy_json(const EnergyAudit &audit, const EnergyBalance &balance)
 {
@@ -306,6 +327,7 @@ PetscErrorCode write_summary(const Options &options, const Output &output, const
       json["steady_change"] = unsteady ? Json(unsteady->change) : Json(nullptr);
       json["unsettled_volume_ml"] = optional_json(unsettled_volume(rows));
       json["static_curve"] = static_curve(rows);
+      if (scene.facts().flow_past_limit_points) json["limit_points"] = limit_points(rows);
       json["peep_trial"] = peep_trial(model.composition(), audits.regions, rows);
       json["breaths"] = Json::array();
       for (const BreathRows &b : breath_rows(rows)) {

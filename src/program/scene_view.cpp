@@ -112,6 +112,12 @@ void describe_breathing(const Scene &scene, std::vector<std::string> &lines)
   }
   const auto &phases = scene.facts().ventilator->phases();
   for (std::size_t i = 0; i < std::min(phases.size(), most_phases); ++i) lines.push_back(phase_text(phases[i]));
+  if (scene.facts().flow_past_limit_points) {
+    const PetscReal flow = *scene.facts().flow_past_limit_points / units::mm3_per_ml;
+    lines.push_back("Where the lung holds no more of a prescribed pressure, past a limit point, " +
+                    (flow > 0 ? "a flow of " + number(flow) + " ml/s" : "the mean flow of the phase until then") +
+                    " is prescribed.");
+  }
   if (phases.size() > most_phases)
     lines.push_back("And so on: " + std::to_string(phases.size()) + " phases in all, up to " +
                     number(phases.back().end) + " s.");

@@ -18,11 +18,13 @@ constexpr PetscReal volume_tolerance = 1e-10;
 void Airway::begin_phase(const Phase &phase, PetscReal volume, PetscReal first_step)
 {
   phase_ = phase;
-  starts_from_before_ = !phase_.from;
-  if (!phase_.from) phase_.from = ventilator_before_;
-  volume_begin_ = volume + scalars_.stored(before_);
+  // past a limit point the phase before did not reach what it was to end at
+  starts_from_before_ = !phase_.from || (past_limit_ && phase_.control == Control::pressure);
+  if (starts_from_before_) phase_.from = ventilator_before_;
+  volume_begin_ = volume_before_ = volume + scalars_.stored(before_);
+  time_before_ = phase_.begin;
   first_step_ = first_step;
-  limited_ = limited_before_ = exceeds_ = retake_ = over_ = false;
+  limited_ = limited_before_ = exceeds_ = retake_ = over_ = flows_ = false;
   highest_flow_ = 0;
   highest_pressure_ = ventilator_before_;
 }
@@ -41,6 +43,12 @@ PetscErrorCode Airway::past(Past &past)
   PetscCall(past.visit("volume_at_phase_begin_mm3", volume_begin_));
   PetscCall(past.visit("first_step_s", first_step_));
   if (scalars_.of_effects()) PetscCall(past.visit("scalars_kPa", before_));
+  if (facts_.flow_past_limit_points) {
+    PetscCall(past.visit("past_limit_point", past_limit_));
+    PetscCall(past.visit("flow_past_limit_point_mm3_per_s", flow_past_limit_));
+    PetscCall(past.visit("time_before_s", time_before_));
+    PetscCall(past.visit("volume_before_mm3", volume_before_));
+  }
   if (phase_.may_end_early()) {
     PetscCall(past.visit("highest_flow_mm3_per_s", highest_flow_));
     PetscCall(past.visit("highest_pressure_kPa", highest_pressure_));
@@ -61,7 +69,7 @@ void Airway::set_mode()
 {
   // the mean over a free surface is no pressure that can be held instead: a limit needs one that is solved for
   if (control() == Control::flow)
-    mode_ = facts_.free_airway() && !phase_.limit ? Mode::free : Mode::solved;
+    mode_ = facts_.free_airway() && !phase_.limit && !flows_ ? Mode::free : Mode::solved;
   else
     mode_ = facts_.tube || scalars_.of_effects() ? Mode::solved : Mode::held;
 }
@@ -106,14 +114,18 @@ Airway::Condition Airway::condition() const
 
 void Airway::begin(PetscReal t, PetscReal step_end)
 {
-  limited_ = limited_before_ || retake_;
+  limited_ = phase_.control == Control::flow && (limited_before_ || retake_);
+  flows_ = phase_.control == Control::pressure && past_limit_ && !retake_;
   exceeds_ = false;
   retake_ = retake_ && scheme_.half_step(); // the whole step that follows belongs to the same attempt
   set_mode();
-  if (control() == Control::flow)
+  if (phase_.control == Control::pressure || limited_) target_ = prescribed_pressure(t, step_end);
+  if (flows_) {
+    inwards_ = prescribed_pressure(step_end, step_end) >= ventilator_before_;
+    volume_target_ = volume_before_ + (inwards_ ? 1 : -1) * flow_past_limit_ * (t - time_before_);
+  } else if (control() == Control::flow) {
     volume_target_ = volume_begin_ + phase_.delivered(t);
-  else
-    target_ = prescribed_pressure(t, step_end);
+  }
   share_of_start_ = share_of_start(t, step_end);
   std::vector<PetscReal> values = before_; // not what a failed attempt left
   if (mode_ == Mode::held) values.front() = target_;
@@ -202,6 +214,16 @@ bool Airway::satisfied() const
   return std::abs(volume_ - volume_target_) <= volume_tolerance * scale;
 }
 
+bool Airway::flow_on()
+{
+  const PetscReal mean = std::abs(volume_before_ - volume_begin_) / (time_before_ - phase_.begin);
+  if (!facts_.flow_past_limit_points || phase_.control != Control::pressure || past_limit_) return false;
+  flow_past_limit_ = *facts_.flow_past_limit_points > 0 ? *facts_.flow_past_limit_points : mean;
+  past_limit_ = flow_past_limit_ > 0 && std::isfinite(flow_past_limit_);
+  retake_ = false;
+  return past_limit_;
+}
+
 PetscErrorCode Airway::pressure(Vec local, PetscReal &pressure)
 {
   PetscFunctionBeginUser;
@@ -212,9 +234,13 @@ PetscErrorCode Airway::pressure(Vec local, PetscReal &pressure)
 
 Verdict Airway::judge(const Attempt &attempt)
 {
-  exceeds_ = !limited_ && phase_.limit && ventilator_pressure(attempt.flow) > *phase_.limit;
+  const PetscReal pressure = ventilator_pressure(attempt.flow);
+  if (flows_)
+    exceeds_ = inwards_ ? pressure >= target_ : pressure <= target_;
+  else
+    exceeds_ = !limited_ && phase_.limit && pressure > *phase_.limit;
   if (exceeds_) return Verdict::again;
-  return limited_ && !limited_before_ ? Verdict::kink : Verdict::accept;
+  return limited_ != limited_before_ || returns() ? Verdict::kink : Verdict::accept;
 }
 
 void Airway::accept(const Attempt &attempt)
@@ -223,6 +249,11 @@ void Airway::accept(const Attempt &attempt)
   before_.front() = pressure_;
   ventilator_before_ = ventilator_pressure(attempt.flow);
   limited_before_ = limited_;
+  past_limit_ = past_limit_ && !returns(); // a phase that prescribes a flow may be in between
+  time_before_ = attempt.time;
+  volume_before_ = attempt.volume + scalars_.stored(scalars_.values());
+  over_ = false;
+  if (flows_) return; // what is prescribed tells nothing of the patient
   highest_flow_ = std::max(highest_flow_, attempt.flow);
   highest_pressure_ = std::max(highest_pressure_, ventilator_before_);
   over_ = (phase_.trigger_flow && attempt.flow > *phase_.trigger_flow) ||

@@ -146,23 +146,16 @@ PetscErrorCode look_at_tissue(const Scene &scene, const Model &model, Vec local,
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-/// Says so if the last rows, of a phase that prescribes pressure, end at a limit point; empty if not.
-std::string limit_point(const std::vector<SignalRow> &rows)
+/// A sentence on a limit point, that begins with a blank.
+std::string sentence(const LimitPoint &limit)
 {
   std::ostringstream text;
-  std::size_t first = rows.size() - 1;
-  while (first > 0 && rows[first - 1].phase == rows.back().phase && rows[first - 1].breath == rows.back().breath)
-    --first;
-  if (first + 2 >= rows.size()) return "";
-  const SignalRow &begin = rows[first], &before = rows[rows.size() - 2], &end = rows.back();
-  const double last = (end.volume - before.volume) / (end.pressure - before.pressure),
-               way = (before.volume - begin.volume) / (before.pressure - begin.pressure);
-  if (!(end.pressure > before.pressure && before.pressure > begin.pressure && last > limit_steepness * way)) return "";
   text.precision(4);
-  text << " Volume follows pressure ever more steeply, by " << last << " ml/cmH2O in the last step and " << way
-       << " on the way there: a limit point. There is no equilibrium above ";
+  text << " Volume follows pressure ever more steeply, by " << limit.last << " ml/cmH2O in the last step and "
+       << limit.on_the_way << " on the way there: a limit point. There is no equilibrium "
+       << (limit.highest ? "above " : "below ");
   text.precision(6);
-  text << end.pressure << " cmH2O.";
+  text << limit.pressure << " cmH2O.";
   return text.str();
 }
 
@@ -179,10 +172,13 @@ bool linear_solver_failed(const FailureFacts &facts)
   return !facts.attempts.empty() && facts.attempts.back().reason.find("LINEAR") != std::string::npos;
 }
 
-/// Whether the last attempt was solved, but changed J by more than a step may.
-bool bound_too_low(const FailureFacts &facts)
+/// The option that bounds the changes of a step, if the last attempt was solved but changed more
+/// (StepBound::complaint); else empty.
+std::string low_bound(const FailureFacts &facts)
 {
-  return !facts.attempts.empty() && facts.attempts.back().reason.rfind(J_change_bound, 0) == 0;
+  if (facts.attempts.empty()) return "";
+  const std::string &reason = facts.attempts.back().reason;
+  return reason.rfind("-step_", 0) == 0 ? reason.substr(0, reason.find(':')) : "";
 }
 
 /// What the diagnosis says, in a sentence that begins with a blank.
@@ -219,7 +215,8 @@ std::string why(const Scene &scene, const FailureFacts &facts, const Diagnosis &
     break;
   case Diagnosis::Kind::solver:
     text << " Where: in the solver. "
-         << (bound_too_low(facts)          ? "The bound of -step_J_change asks for shorter steps than there may be"
+         << (!low_bound(facts).empty()
+                 ? "The bound of " + low_bound(facts) + " asks for shorter steps than there may be"
              : linear_solver_failed(facts) ? "The linear solver failed"
                                            : "Newton's method stalled")
          << " while no cell of the last step is near turning inside out (least J = " << facts.rows.back().min_J
@@ -239,15 +236,17 @@ std::string what_to_try(const Scene &scene, const FailureFacts &facts, const Dia
     return std::string(wall ? "" : "-lumen_pressure (here it is off: nothing but springs bears the airway's wall), ") +
            "a finer mesh there, a slower rise or fall of pressure or flow, another -tissue.";
   case Diagnosis::Kind::everywhere:
-    return "less pressure or volume, prescribed flow (-ventilator vcv), which goes on beyond a limit point of the "
-           "pressure, more that holds the lung (-chest_wall), another -tissue.";
+    return std::string("less pressure or volume, ") +
+           (facts.could_flow_on && !d.limit.empty() ? "-ventilator_on_limit_point flow, or " : "") +
+           "prescribed flow (-ventilator vcv), which goes on beyond a limit point of the pressure, more that holds the "
+           "lung (-chest_wall), another -tissue.";
   case Diagnosis::Kind::inside:
     return "a finer mesh there, a slower rise or fall of pressure or flow, another -tissue.";
   case Diagnosis::Kind::solver:
     break;
   }
-  if (bound_too_low(facts))
-    return "a larger -step_J_change, a smaller -ts_adapt_dt_min, a slower rise or fall of pressure or flow.";
+  if (const std::string bound = low_bound(facts); !bound.empty())
+    return "a larger " + bound + ", a smaller -ts_adapt_dt_min, a slower rise or fall of pressure or flow.";
   return std::string(scene.facts().surface_pressures_by.empty()
                          ? ""
                          : "the sizes and resistances of -" + scene.facts().surface_pressures_by +
@@ -300,6 +299,22 @@ PetscErrorCode check_stable_at_rest(const Options &options, const Scene &scene, 
                  law.name(), where.str().c_str(), why.c_str(), given.c_str());
 }
 
+std::optional<LimitPoint> limit_point(const std::vector<SignalRow> &rows, const Measures &last)
+{
+  std::size_t first = rows.size() - 1;
+  if (!(last.min_J > well_formed) || rows.back().past_limit) return {};
+  while (first > 0 && rows[first - 1].phase == rows.back().phase && rows[first - 1].breath == rows.back().breath &&
+         !rows[first - 1].past_limit)
+    --first;
+  if (first + 2 >= rows.size()) return {};
+  const SignalRow &begin = rows[first], &before = rows[rows.size() - 2], &end = rows.back();
+  const double step = end.pressure - before.pressure, way = before.pressure - begin.pressure;
+  const LimitPoint limit = {end.pressure, step > 0, (end.volume - before.volume) / step,
+                            (before.volume - begin.volume) / way};
+  if (!(step * way > 0 && limit.last > limit_steepness * limit.on_the_way && limit.on_the_way > 0)) return {};
+  return limit;
+}
+
 const char *Diagnosis::name() const
 {
   switch (kind) {
@@ -332,7 +347,7 @@ PetscErrorCode diagnose(const Scene &scene, const Model &model, const FailureFac
     d.worst = last;
   if (d.worst) PetscCall(look_at_rim(scene, *d.worst, d.from_rim, at_rim));
   // tissue that folds at a rim gives way, too; at a limit point all of it is well, and only attempts turn it inside out
-  if (well && facts.prescribes_pressure) d.limit = limit_point(facts.rows);
+  if (const auto limit = limit_point(facts.rows, last); limit && facts.prescribes_pressure) d.limit = sentence(*limit);
   if (!d.limit.empty() || d.acoustic_lost)
     d.kind = Diagnosis::Kind::everywhere;
   else if (linear_solver_failed(facts) && !facts.attempts.back().inverted && last.min_J > folded)
@@ -385,6 +400,10 @@ std::string failure_text(const Scene &scene, const FailureFacts &facts, const Di
       text << " -ventilator_flow_split uniform shares the flow by area: " << unequal << ".";
       first += "-ventilator_flow_split common_pressure, ";
     }
+  }
+  if (facts.past_limit) {
+    text << " A flow is prescribed here, past a limit point of the pressure (-ventilator_on_limit_point).";
+    first += "another -ventilator_limit_point_flow, ";
   }
   text << " What to try: " << first << what_to_try(scene, facts, d);
   return text.str();

@@ -90,6 +90,7 @@ PetscErrorCode Simulation::persist_rows(Archive &archive)
     std::size_t phase = archive.reading() ? 0 : phases.number(row.phase);
     cells(row.time, row.pressure, row.flow, row.volume, phase, row.breath, row.dt, row.newton, row.krylov, row.min_J,
           row.max_J, row.hold, row.ventilator_pressure);
+    if (scene_.facts().flow_past_limit_points) cells(row.past_limit);
     for (double &pressure : row.scalars) cells(pressure);
     for (double &flow : row.scalar_flows) cells(flow);
     if (!row.scalars.empty()) cells(row.stored_flow);
@@ -114,6 +115,7 @@ PetscErrorCode Simulation::persist_begin(Archive &archive, AttemptBegin &begin)
   PetscCall(archive.value("attempt/always_new", begin.always_new));
   PetscCall(archive.value("attempt/looks_back", begin.looks_back));
   PetscCall(archive.value("attempt/limited", begin.limited));
+  if (scene_.facts().flow_past_limit_points) PetscCall(archive.value("attempt/past_limit_point", begin.past_limit));
   PetscCall(archive.value("attempt/crawled", begin.crawled));
   PetscCall(archive.table("attempt_failures", begin.failures, FailedAttempt(), [](FailedAttempt &f, TableCells &cells) {
     Measures &m = f.measures;
@@ -145,6 +147,7 @@ PetscErrorCode Simulation::persist_attempt(Archive &archive, AttemptBegin begin)
   crawled_ = begin.crawled;
   failures_ = begin.failures;
   airway_.retake(begin.limited);
+  if (scene_.facts().flow_past_limit_points) airway_.past_limit(begin.past_limit);
   PetscCall(TSGetSNES(ts_, &snes));
   if (begin.always_new && lagging_.in_use()) PetscCall(lagging_.stop_lagging(snes));
   PetscFunctionReturn(PETSC_SUCCESS);

@@ -189,7 +189,7 @@ PetscErrorCode Simulation::create_solver()
   PetscBool tests_jacobian;
   PetscCall(PetscOptionsHasName(nullptr, nullptr, "-snes_test_jacobian", &tests_jacobian));
   tests_jacobian_ = tests_jacobian;
-  if (lagging_.in_use() || predictor_.in_use() ||
+  if (lagging_.in_use() || predictor_.in_use() || scene_.facts().flow_past_limit_points ||
       (scene_.facts().ventilator && scene_.facts().ventilator->prescribes_flow()))
     PetscCall(SNESSetConvergenceTest(snes, newton_converged, this, nullptr));
   if (scene_.facts().unknown_opening_pressure()) {
@@ -201,8 +201,9 @@ PetscErrorCode Simulation::create_solver()
     PetscBool newton;
     SNESType type;
     const SceneFacts &facts = scene_.facts();
-    const bool limits = facts.ventilator->limits_pressure(),
-               split = facts.airflow && !facts.tube && !limits && facts.surface_pressures_by.empty();
+    const bool limits = facts.ventilator->limits_pressure(), split = facts.airflow && !facts.tube && !limits &&
+                                                                     !facts.flow_past_limit_points &&
+                                                                     facts.surface_pressures_by.empty();
     PetscCall(PetscObjectTypeCompare((PetscObject)snes, SNESNEWTONLS, &newton));
     PetscCall(SNESGetType(snes, &type));
     PulmoUserCheck(
@@ -213,6 +214,7 @@ PetscErrorCode Simulation::create_solver()
         !facts.surface_pressures_by.empty() ? ("-" + facts.surface_pressures_by).c_str()
         : facts.tube                        ? "-tube"
         : limits                            ? "a limit of pressure"
+        : facts.flow_past_limit_points      ? "-ventilator_on_limit_point flow"
         : split                             ? "-ventilator_flow_split common_pressure"
                                             : "a flow into a lung with -airflow off",
         split ? ", or -ventilator_flow_split uniform" : "");
@@ -237,6 +239,12 @@ PetscErrorCode Simulation::create_solver()
   PulmoUserCheck(!limits_steps || step_control_.in_use(), comm,
                  "-ts_adapt_dt_max: steps do not grow beyond -ts_dt unless their error chooses them; lower -ts_dt, or "
                  "give -step_volume_tolerance and -step_pressure_tolerance");
+  for (const StepBound &bound : step_control_.bounds())
+    PulmoUserCheck(
+        !bound.in_use() || bound.quantity != StepBound::Quantity::pressure || scene_.facts().airflow ||
+            scene_.facts().ventilator,
+        comm, "%s: this scene has no gas whose pressure could change; add -airflow or a -ventilator, or leave it out",
+        bound.option);
   if (adapt->dt_min > wanted_dt_)
     PetscCall(PetscPrintf(comm,
                           "pulmo: warning: -ts_adapt_dt_min %g s is longer than -ts_dt %g s: no step can be cut, and "

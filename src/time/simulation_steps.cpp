@@ -27,8 +27,8 @@ constexpr PetscReal rounding = 1e-13;
 /// Steps in which pressure spreads over so many cells' squares leave gas that is large beside what moves.
 constexpr PetscReal fast_gas = 1e4;
 
-/// A step that changed J by too much is cut to this share of itself at least, and at most.
-constexpr PetscReal least_J_cut = 0.1, largest_J_cut = 0.9;
+/// A step that changed a bounded quantity by too much is cut to this share of itself at least, and at most.
+constexpr PetscReal least_bound_cut = 0.1, largest_bound_cut = 0.9;
 
 /// Failed attempts that are remembered.
 constexpr std::size_t max_failures = 12;
@@ -37,9 +37,8 @@ constexpr std::size_t max_failures = 12;
 
 PetscReal Simulation::next_step(PetscReal t, PetscReal h, TSAdapt adapt, PetscBool &accept)
 {
-  // the step after this one must not change J by too much either, if that goes on as it did
-  const PetscReal longest =
-      step_control_.J_change() > 0 ? h * step_control_.length_within_J_change(J_change_) : PETSC_MAX_REAL;
+  // the step after this one must not change a bounded quantity by too much either, if that goes on as it did
+  const PetscReal longest = h * step_control_.tightest().length_within();
   accept = PETSC_TRUE;
   if (!step_control_.in_use()) {
     if (cut_)
@@ -182,7 +181,7 @@ PetscErrorCode Simulation::accept_stage(PetscReal t, Vec X, PetscBool *accept)
   PetscCall(airway_.pressure(local_, attempt.pressure));
   attempt.flow = airway_.opening_flow(scheme_.flow(measures.volume_change));
   PetscCall(ask_partners(attempt, accept));
-  if (*accept && step_control_.J_change() > 0) PetscCall(judge_J_change(dt, accept));
+  if (*accept) PetscCall(judge_changes(attempt, accept));
   if (!*accept) PetscFunctionReturn(PETSC_SUCCESS);
   bool solved;
   candidate_ = {t, measures.volume_change / units::mm3_per_ml, attempt.pressure / units::kPa_per_cmH2O};
@@ -216,7 +215,7 @@ PetscErrorCode Simulation::ask_partners(const Attempt &attempt, PetscBool *accep
   *accept = PetscBool(verdict <= Verdict::kink);
   kink_ = verdict == Verdict::kink;
   if (verdict == Verdict::again) {
-    went("again, with the limit of the phase held");
+    went("again, " + why);
     for (Partner *partner : partners_) partner->reject(verdict);
     PetscCall(keep_step(attempt.dt));
   }
@@ -224,19 +223,31 @@ PetscErrorCode Simulation::ask_partners(const Attempt &attempt, PetscBool *accep
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
-PetscErrorCode Simulation::judge_J_change(PetscReal dt, PetscBool *accept)
+PetscErrorCode Simulation::measure_change(const Attempt &attempt, StepBound::Quantity quantity, PetscReal &change) const
 {
-  const PetscReal bound = step_control_.J_change();
-  std::ostringstream why;
-
   PetscFunctionBeginUser;
-  PetscCall(model_.largest_J_change(before_, local_, J_change_));
-  if (J_change_ <= bound) PetscFunctionReturn(PETSC_SUCCESS);
+  if (quantity == StepBound::Quantity::log_J)
+    PetscCall(model_.largest_J_change(before_, attempt.local, change));
+  else {
+    if (scene_.facts().airflow)
+      PetscCall(model_.largest_pressure_change(before_, attempt.local, change));
+    else
+      change = std::abs(attempt.pressure - accepted_.pressure * units::kPa_per_cmH2O);
+    change /= units::kPa_per_cmH2O;
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Simulation::judge_changes(const Attempt &attempt, PetscBool *accept)
+{
+  PetscFunctionBeginUser;
+  for (StepBound &bound : step_control_.bounds())
+    if (bound.in_use()) PetscCall(measure_change(attempt, bound.quantity, bound.change));
+  const StepBound &tightest = step_control_.tightest();
+  if (tightest.met()) PetscFunctionReturn(PETSC_SUCCESS);
   *accept = PETSC_FALSE;
-  why << J_change_bound << ": |ln J| changed by " << J_change_ << ", " << bound << " at most";
-  const PetscReal share =
-      std::clamp<PetscReal>(step_control_.length_within_J_change(J_change_), least_J_cut, largest_J_cut);
-  PetscCall(reject(dt, why.str(), 0, Measures(), false, share));
+  const PetscReal share = std::clamp<PetscReal>(tightest.length_within(), least_bound_cut, largest_bound_cut);
+  PetscCall(reject(attempt.dt, tightest.complaint(), 0, Measures(), false, share));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -256,6 +267,7 @@ AttemptBegin Simulation::next_attempt() const
   begin.always_new = lagging_.always_new();
   begin.looks_back = scheme_.looks_back();
   begin.limited = airway_.retakes();
+  begin.past_limit = airway_.past_limit();
   begin.crawled = crawled_;
   begin.failures = failures_;
   return begin;
@@ -401,9 +413,42 @@ PetscErrorCode Simulation::reject(PetscReal dt, const std::string &reason, Petsc
   PetscCall(TSGetAdapt(ts_, &adapt));
   const PetscReal next = dt * share.value_or(adapt->scale_solve_failed);
   if (share) PetscCall(TSSetTimeStep(ts_, next / adapt->scale_solve_failed)); // PETSc cuts it
-  if (next < std::max(adapt->dt_min, least_step * asked_dt()))
+  if (next < std::max(adapt->dt_min, least_step * asked_dt())) {
+    bool flows_on;
+    PetscCall(flow_on(flows_on));
+    if (flows_on) {
+      PetscCall(keep_step(landing(accepted_.time)));
+      PetscFunctionReturn(PETSC_SUCCESS);
+    }
     PetscCall(TSSetConvergedReason(ts_, TS_DIVERGED_STEP_REJECTED));
+  }
   PetscCall(heed_request(TS_DIVERGED_STEP_REJECTED));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
+PetscErrorCode Simulation::flow_on(bool &flows_on)
+{
+  Measures last;
+
+  PetscFunctionBeginUser;
+  flows_on = false;
+  if (!scene_.facts().flow_past_limit_points) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(model_.measure(before_, last));
+  const auto limit = limit_point(rows_, last);
+  flows_on = limit && airway_.flow_on();
+  if (!flows_on) PetscFunctionReturn(PETSC_SUCCESS);
+  cut_ = false;
+  crawled_ = 0;
+  failures_.clear();
+  dt_ = asked_dt();
+  begin_smooth_stretch();
+  PetscCall(PetscPrintf(options_.comm(),
+                        "pulmo: note: a limit point at t = %.6g s (phase '%s'): at %.6g ml there is no equilibrium %s "
+                        "%.6g cmH2O; from there on a flow of %.4g ml/s is prescribed, until the pressure of the phase "
+                        "can be held again\n",
+                        (double)accepted_.time, phase_->name.c_str(), accepted_.volume,
+                        limit->highest ? "above" : "below", limit->pressure,
+                        (double)(airway_.flow_past_limit() / units::mm3_per_ml)));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -455,6 +500,7 @@ PetscErrorCode Simulation::after_step()
   PetscCall(record_stage(t, static_cast<PetscInt>(rows_.size()), local_));
   const PetscReal opening_flow = airway_.opening_flow(row.flow * units::mm3_per_ml);
   const Attempt accepted{t, row.dt, measures.volume_change, pressure, opening_flow, local_};
+  const bool was_past_limit = airway_.past_limit();
   for (Partner *partner : partners_) partner->accept(accepted);
   // -ts_max_time may end the phase at hand where it ends by itself
   const auto index = static_cast<std::size_t>(phase_ - phases_.data());
@@ -468,6 +514,7 @@ PetscErrorCode Simulation::after_step()
   list_scalars(row);
   row.phase = phase_->name;
   row.hold = airway_.holds_volume();
+  row.past_limit = airway_.past_limit();
   row.breath = static_cast<int>(phase_->breath);
   row.newton = newton_;
   row.krylov = krylov_;
@@ -480,11 +527,22 @@ PetscErrorCode Simulation::after_step()
   PetscCall(scheme_.accept(model_, moment(t, measures.volume_change, local_)));
   step_control_.accept({t, row.volume, row.pressure});
   balance_.accept();
+  if (was_past_limit && !airway_.past_limit())
+    PetscCall(PetscPrintf(options_.comm(),
+                          "pulmo: note: from t = %.6g s and %.6g ml on (phase '%s') the pressure of the phase is held "
+                          "again\n",
+                          (double)accepted_.time, accepted_.volume, phase_->name.c_str()));
   accepted_ = row;
-  if (kink) {
+  bool flows_on = false;
+  if (crawls()) { // at a limit point steps may do so
+    rows_.push_back(row);
+    PetscCall(flow_on(flows_on));
+    rows_.pop_back();
+  }
+  if (kink || flows_on) {
     begin_smooth_stretch();
     PetscCall(TSRestartStep(ts_));
-    if (step_control_.in_use()) PetscCall(TSSetTimeStep(ts_, landing(t)));
+    if (step_control_.in_use() || flows_on) PetscCall(TSSetTimeStep(ts_, landing(t)));
     PetscCall(TSGetTimeStep(ts_, &next_dt_));
   }
   PetscCall(report(row, measures));
@@ -557,7 +615,12 @@ FailureFacts Simulation::failure_facts() const
   facts.rows = rows_;
   facts.crawled = crawls();
   facts.free_flow = airway_.mode() == Airway::Mode::free;
-  facts.prescribes_pressure = phase_ && phase_->control == Control::pressure;
+  facts.prescribes_pressure = phase_ && phase_->control == Control::pressure && !airway_.past_limit();
+  facts.past_limit = airway_.past_limit();
+  const Programme *ventilator =
+      scene_.facts().ventilator.get(); // pcv prescribes no flow, phases of vcv are from no file
+  facts.could_flow_on = ventilator && !scene_.facts().flow_past_limit_points &&
+                        (!ventilator->prescribes_flow() || (phase_ && !phase_->where.empty()));
   if (phase_) facts.phase = phase_->name;
   return facts;
 }

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <sstream>
 
 namespace pulmo {
 
@@ -31,7 +32,11 @@ PetscErrorCode StepControl::declare(Options &options)
   PetscCall(options.real("J_change", "-", Range::not_negative(),
                          "largest |ln(J / J before the step)| of any quadrature point in a step; one with more is cut, "
                          "and those after it stay short enough (0: no bound)",
-                         J_change_));
+                         bounds_[0].most));
+  PetscCall(options.real("p_change", "cmH2O", Range::not_negative(),
+                         "largest change of the alveolar pressure p at any node in a step (with -airflow off: of the "
+                         "gas pressure); one with more is cut, and those after it stay short enough (0: no bound)",
+                         bounds_[1].most));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -72,9 +77,23 @@ std::optional<double> StepControl::error(int order, const Value &value, Free fre
   return largest;
 }
 
-double StepControl::length_within_J_change(double change) const
+PetscReal StepBound::length_within() const
 {
-  return change > 0 ? safety * J_change_ / change : std::numeric_limits<double>::infinity();
+  return in_use() && change > 0 ? safety * most / change : std::numeric_limits<PetscReal>::infinity();
+}
+
+std::string StepBound::complaint() const
+{
+  std::ostringstream text;
+  text << option << ": " << symbol << " changed by " << change << unit << ", " << most << unit << " at most";
+  return text.str();
+}
+
+const StepBound &StepControl::tightest() const
+{
+  return *std::min_element(bounds_.begin(), bounds_.end(), [](const StepBound &a, const StepBound &b) {
+    return a.length_within() < b.length_within();
+  });
 }
 
 double StepControl::growth(int order, double error)

@@ -101,6 +101,8 @@ public:
   PetscErrorCode measure(Vec x, Measures &measures) const;
   /// Largest |ln(J in y / J in x)| of all quadrature points, local vectors with J > 0. Collective.
   PetscErrorCode largest_J_change(Vec x, Vec y, PetscReal &change) const;
+  /// Largest |change of the pressure| (kPa) of any node from @p x to @p y. Collective.
+  PetscErrorCode largest_pressure_change(Vec x, Vec y, PetscReal &change) const;
   /// int cof F(x) : Grad y, the derivative of int (J - 1) in direction @p y, mm^3. Collective.
   PetscErrorCode volume_derivative(Vec x, Vec y, PetscReal &derivative) const;
   /// Adds @p factor times the derivative of int (J - 1) q by the displacements to @p y; q is the pressure field of @p

@@ -100,6 +100,10 @@ public:
   {
     return assembly_.largest_J_change(x, y, change);
   }
+  PetscErrorCode largest_pressure_change(Vec x, Vec y, PetscReal &change) const
+  {
+    return assembly_.largest_pressure_change(x, y, change);
+  }
   /// d(int (J - 1))/dx in direction @p y, mm^3 (local vectors).
   PetscErrorCode volume_derivative(Vec x, Vec y, PetscReal &derivative) const
   {

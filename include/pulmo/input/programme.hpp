@@ -47,6 +47,7 @@ public:
 
   const std::vector<Phase> &phases() const { return phases_; }
   bool prescribes_flow() const;
+  bool prescribes_pressure() const;
   bool limits_pressure() const;
   /// Whether some phase may end early: the phases after it begin earlier then.
   bool may_end_early() const;

@@ -638,6 +638,9 @@ struct SceneFacts {
   std::vector<std::function<PetscReal(PetscReal t)>> courses;
   Settling settling;
   FlowSplit flow_split = FlowSplit::automatic;
+  /// Where no more of a prescribed pressure can be held a flow of this size is prescribed, mm^3/s; 0: the mean one of
+  /// the phase until then; none: the run ends there.
+  std::optional<PetscReal> flow_past_limit_points;
   std::optional<AirwayResistance> tube;         ///< between ventilator and airway
   std::function<AirwayResistance()> tube_again; ///< that of its settings as they are now
   std::string surface_pressures_by; ///< the effect that solves for the pressures of the open surfaces; or nothing
@@ -653,7 +656,7 @@ struct SceneFacts {
   bool unknown_opening_pressure() const
   {
     return ventilator && (!surface_pressures_by.empty() || tube || ventilator->limits_pressure() ||
-                          (ventilator->prescribes_flow() && !free_airway()));
+                          flow_past_limit_points || (ventilator->prescribes_flow() && !free_airway()));
   }
 };
 

@@ -23,6 +23,7 @@ struct SignalRow {
   std::vector<double> integrals;             ///< of what effects remember (Composition::integrals)
   double stored_flow = 0;                    ///< flow through the opening that does not enter the lung, ml/s
   bool hold = false;                         ///< the phase holds the volume (prescribed flow 0)
+  bool past_limit = false; ///< after a limit point; no prescribed pressure was held again yet, flows are prescribed
   std::optional<double> ventilator_pressure; ///< on the machine's side of a tube, cmH2O; without one the airway's
   std::optional<double> alveolar_pressure;   ///< mean over the reference volume, cmH2O; empty without airflow
   double rest_volume = 0;                    ///< of the lung, ml; 0: not known

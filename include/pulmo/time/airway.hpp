@@ -20,6 +20,10 @@ namespace pulmo {
 ///         airway tree gives them.
 ///
 /// A flow phase prescribes the volume at the end of each step, so that errors of the solver do not add up.
+///
+/// Past a limit point of the pressure (SceneFacts::flow_past_limit_points) a flow of constant size is prescribed in a
+/// pressure phase, too: inwards where the lung has less than the pressure of the phase, else outwards, until the
+/// unknown pressure meets that.
 class Airway final : public Partner {
 public:
   enum class Mode { held, free, solved };
@@ -42,17 +46,31 @@ public:
   /// The scheme has begun the stage.
   void begin(PetscReal t, PetscReal step_end) override;
   /// Asks for the step again, with the limit of the phase held, if the ventilator's pressure exceeds that (to the end
-  /// of the phase, if such an attempt is accepted): a shorter one would let the flow overshoot.
+  /// of the phase, if such an attempt is accepted): a shorter one would let the flow overshoot. Past a limit point it
+  /// asks for the step again with the pressure of the phase held, if that was met.
   Verdict judge(const Attempt &attempt) override;
-  void reject(Verdict how) override { retake_ = how == Verdict::again && (limited_ || exceeds_); }
+  std::string why() const override
+  {
+    return flows_ ? "with the pressure of the phase held" : "with the limit of the phase held";
+  }
+  void reject(Verdict how) override { retake_ = how == Verdict::again && (limited_ || returns() || exceeds_); }
   void accept(const Attempt &attempt) override;
   /// What a step needs of the phase and of the steps before it; the phase was begun.
   PetscErrorCode past(Past &past) override;
   /// Whether the step accepted last met what ends the phase early.
   bool phase_is_over() const { return over_; }
-  /// Whether the next attempt is to hold the limit of the phase, as the one before it asked; and makes it so.
+  /// From the state accepted last on a flow is prescribed, if the scene asks for that and a pressure was until now.
+  /// Whether that is so.
+  bool flow_on();
+  /// The size of that flow, mm^3/s.
+  PetscReal flow_past_limit() const { return flow_past_limit_; }
+  /// Whether steps that begin now are past a limit point; and makes it so.
+  bool past_limit() const { return past_limit_; }
+  void past_limit(bool past) { past_limit_ = past; }
+  /// Whether the next attempt is to hold the pressure that was met (the limit of the phase, or past a limit point what
+  /// the phase prescribes), as the one before it asked; and makes it so.
   bool retakes() const { return retake_; }
-  void retake(bool limited) { retake_ = limited; }
+  void retake(bool held) { retake_ = held; }
   /// After past() has read: takes the scalars, and puts those that have no node into a global vector.
   PetscErrorCode restore(Vec X);
 
@@ -98,7 +116,7 @@ public:
     return pressure_ + (facts_.tube ? facts_.tube->drop(flow) : 0);
   }
   /// Whether the volume is held: a prescribed flow of zero.
-  bool holds_volume() const { return control() == Control::flow && phase_.to == 0 && phase_.ramp == 0; }
+  bool holds_volume() const { return control() == Control::flow && !flows_ && phase_.to == 0 && phase_.ramp == 0; }
 
   Mode mode() const { return mode_; }
   /// What the stage at hand asks of the airway, for whoever makes its equations again.
@@ -121,8 +139,10 @@ public:
   PetscReal flow() const { return scheme_.flow(volume_target_); }
 
 private:
-  /// What the phase prescribes: after its limit was reached a pressure.
-  Control control() const { return limited_ ? Control::pressure : phase_.control; }
+  /// Whether the step at hand holds the pressure of the phase for the first time since a limit point.
+  bool returns() const { return phase_.control == Control::pressure && past_limit_ && !flows_; }
+  /// What the phase prescribes: after its limit was reached a pressure, past a limit point a flow.
+  Control control() const { return limited_ ? Control::pressure : flows_ ? Control::flow : phase_.control; }
   void set_mode();
   /// The pressure that the phase prescribes, kPa.
   PetscReal prescribed_pressure(PetscReal t, PetscReal step_end) const;
@@ -141,13 +161,17 @@ private:
   bool starts_from_before_ = false;                   ///< a ramp begins at what the ventilator has then
   PetscReal share_of_start_ = 0;                      ///< in target_
   bool limited_ = false, limited_before_ = false;     ///< the limit is held now, was held in the step before
-  bool exceeds_ = false;                              ///< the attempt judged last exceeds it
-  bool retake_ = false;                               ///< the next attempt is the first one with the limit held
+  bool exceeds_ = false;                              ///< the attempt judged last exceeds it, or met the pressure
+  bool retake_ = false;                               ///< the next attempt is the first one with that held
+  bool flows_ = false, past_limit_ = false;           ///< a flow is prescribed past a limit point now, from here on
+  bool inwards_ = true;                               ///< where that flow goes
+  PetscReal flow_past_limit_ = 0;                     ///< its size, mm^3/s
   PetscReal pressure_ = 0;                            ///< at the opening now, kPa
   PetscReal ventilator_before_ = 0;                   ///< at the ventilator before the step, kPa
   PetscReal target_ = 0;                              ///< pressure that the phase prescribes, kPa
   PetscReal volume_begin_ = 0;                        ///< of the gas at the begin of the phase, mm^3
   PetscReal volume_target_ = 0, volume_ = 0;          ///< of the gas: prescribed; at the last close(), mm^3
+  PetscReal time_before_ = 0, volume_before_ = 0;     ///< at the last accepted step, s and of the gas, mm^3
   PetscReal past_flow_ = 0;                           ///< share of the past in the rate of that, mm^3/s
   PetscReal first_step_ = 0;                          ///< of the phase, s
   PetscReal highest_flow_ = 0, highest_pressure_ = 0; ///< of the phase, into the lung and at the ventilator

@@ -14,9 +14,6 @@
 
 namespace pulmo {
 
-/// What the reason of an attempt begins with that changed J by too much.
-inline constexpr const char *J_change_bound = "-step_J_change";
-
 /// An attempt at a step that was not accepted.
 struct FailedAttempt {
   PetscReal time = 0, dt = 0; ///< where the step began and how long it was, s
@@ -34,7 +31,8 @@ struct AttemptBegin {
   bool cut = false;                    ///< the step was cut before
   bool always_new = false;             ///< no Jacobian is kept
   bool looks_back = false;             ///< the time scheme does, beyond the state before the step
-  bool limited = false;                ///< the attempt before it asked for this one with the limit of the phase held
+  bool limited = false;                ///< the attempt before it asked for this one with a pressure held
+  bool past_limit = false;             ///< it is past a limit point
   int crawled = 0;                     ///< accepted steps in a row before it that were tiny
   std::vector<FailedAttempt> failures; ///< that are remembered by then
 };
@@ -49,13 +47,25 @@ struct AttemptRecord {
 /// Refuses a model with cells whose tissue is not stable at rest; the message names the law's options. Collective.
 PetscErrorCode check_stable_at_rest(const Options &options, const Scene &scene, const Model &model);
 
+/// The end of a way along which volume follows pressure ever more steeply.
+struct LimitPoint {
+  double pressure = 0;             ///< that is held there, cmH2O
+  bool highest = true;             ///< there is no equilibrium above it; else below
+  double last = 0, on_the_way = 0; ///< change of volume by pressure in the last step, and before it, ml/cmH2O
+};
+
+/// Whether the last rows, of a phase that prescribes pressure, end at one. @p last: of the last state.
+std::optional<LimitPoint> limit_point(const std::vector<SignalRow> &rows, const Measures &last);
+
 /// What is known of the end of a run.
 struct FailureFacts {
   std::vector<FailedAttempt> attempts; ///< the last ones
   std::vector<SignalRow> rows;         ///< accepted, of the whole run
   bool crawled = false;                ///< it ended because steps only crawled
   bool free_flow = false;              ///< in a phase that shares a prescribed flow by area
-  bool prescribes_pressure = false;    ///< in a phase that prescribes pressure
+  bool prescribes_pressure = false;    ///< as its phase does
+  bool could_flow_on = false;          ///< -ventilator_on_limit_point could be flow, and is not
+  bool past_limit = false;             ///< a flow is prescribed past a limit point
   std::string phase = "run";
 };
 

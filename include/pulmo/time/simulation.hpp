@@ -175,8 +175,13 @@ private:
   /// @p share: the length of the next one over this one's, where something tells.
   PetscErrorCode reject(PetscReal dt, const std::string &reason, PetscInt newton, const Measures &measures,
                         bool inverted, std::optional<PetscReal> share = {});
-  /// Holds the state in local_ against -step_J_change, and asks for a shorter step if it changes J by more.
-  PetscErrorCode judge_J_change(PetscReal dt, PetscBool *accept);
+  /// Holds what @p attempt changed against the bounds of -step_J_change and -step_p_change, and asks for a shorter step
+  /// if that is more.
+  PetscErrorCode judge_changes(const Attempt &attempt, PetscBool *accept);
+  PetscErrorCode measure_change(const Attempt &attempt, StepBound::Quantity quantity, PetscReal &change) const;
+  /// Lets the run go on past the limit point that its last accepted state is at, if there is one and the scene asks for
+  /// that; whether it does.
+  PetscErrorCode flow_on(bool &flows_on);
   PetscErrorCode report(SignalRow row, const Measures &measures);
   /// Lays out the phases again, those that ended early as long as they were.
   void lay_out_phases();
@@ -240,7 +245,6 @@ private:
   struct {
     Vec step = nullptr, product = nullptr;
   } bordered_;                  ///< a bordered step and the residual at its start, until the search along it begins
-  PetscReal J_change_ = 0;      ///< that the stage judged last makes, where -step_J_change bounds it
   PetscReal start_norm_ = 0;    ///< residual of the attempt at hand before any Newton step and guess
   int extra_newton_ = 0;        ///< Newton steps of the attempt at hand for the prescribed volume alone
   bool inverted_ = false;       ///< the attempt at hand met J <= 0, or no air

@@ -5,7 +5,31 @@
 #include "pulmo/fem/archive.hpp"
 #include "pulmo/input/options.hpp"
 
+#include <array>
+#include <string>
+
 namespace pulmo {
+
+/// The largest change of a quantity that a step may make at any place; one with more is cut.
+struct StepBound {
+  enum class Quantity {
+    log_J,   ///< ln J, at quadrature points
+    pressure ///< of the gas, cmH2O, at nodes; without airflow that of all gas
+  };
+  Quantity quantity;
+  const char *option;   ///< with its hyphen
+  const char *symbol;   ///< in messages
+  const char *unit;     ///< with a blank before it; empty if there is none
+  PetscReal most = 0;   ///< 0: any
+  PetscReal change = 0; ///< that the stage judged last made
+
+  bool in_use() const { return most > 0; }
+  bool met() const { return !in_use() || change <= most; }
+  /// The length of a step that would make somewhat less than the change allowed, over that of the one judged last.
+  PetscReal length_within() const;
+  /// Why the step judged last was not accepted; begins with the option and a colon.
+  std::string complaint() const;
+};
 
 /// Estimates the error that one step makes in the volume of the lung and in the airway pressure from divided
 /// differences of the last values since the last kink, and proposes the next step.
@@ -23,14 +47,14 @@ public:
     bool volume = true, pressure = true;
   };
 
-  /// Declares -step_volume_tolerance, -step_pressure_tolerance and -step_J_change.
+  /// Declares -step_volume_tolerance, -step_pressure_tolerance, -step_J_change and -step_p_change.
   PetscErrorCode declare(Options &options);
   bool in_use() const { return volume_tolerance_ > 0 || pressure_tolerance_ > 0; }
   PetscReal volume_tolerance() const { return volume_tolerance_; }     ///< ml
   PetscReal pressure_tolerance() const { return pressure_tolerance_; } ///< cmH2O
-  PetscReal J_change() const { return J_change_; }                     ///< that a step may make, as |ln J|; 0: any
-  /// The length of a step that would change J by somewhat less than it may, over that of one that made @p change.
-  double length_within_J_change(double change) const;
+  std::array<StepBound, 2> &bounds() { return bounds_; }
+  /// The bound that asks for the shortest step after what the stage judged last changed.
+  const StepBound &tightest() const;
   PetscErrorCode persist(Archive &archive);
 
   /// Forgets all before @p value: the time derivatives jump there.
@@ -45,7 +69,8 @@ public:
 
 private:
   PetscReal volume_tolerance_ = 0, pressure_tolerance_ = 0; ///< ml, cmH2O
-  PetscReal J_change_ = 0;
+  std::array<StepBound, 2> bounds_ = {{{StepBound::Quantity::log_J, "-step_J_change", "|ln J|", ""},
+                                       {StepBound::Quantity::pressure, "-step_p_change", "p", " cmH2O"}}};
   std::vector<Value> past_; ///< the last one first
 };
 

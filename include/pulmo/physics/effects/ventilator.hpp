@@ -102,6 +102,16 @@ public:
                              "more than one patch",
                              split_));
     options.tolerate("flow_split");
+    const bool pressures = pcv || mode_ == "programme";
+    options.group(name(), "limit points", pressures, "-ventilator pcv or programme");
+    PetscCall(options.choice("on_limit_point", {"stop", "flow"},
+                             "what happens where the lung holds no more of a prescribed pressure: stop: the run ends; "
+                             "flow: a flow is prescribed from there on, until the pressure can be held again",
+                             on_limit_point_));
+    options.group(name(), "flow past limit points", pressures && on_limit_point_ == "flow",
+                  "-ventilator_on_limit_point flow");
+    PetscCall(options.real("limit_point_flow", "ml/s", Range::not_negative(),
+                           "size of that flow (0: the mean flow of the phase up to there)", limit_point_flow_));
 
     PetscCall(check_settings(options));
     if (mode_ == "programme") {
@@ -111,6 +121,10 @@ public:
       PetscCall(read_programme(options.comm(), "-ventilator_programme", file_, read_));
       for (Phase &phase : read_)
         if (phase.dt) *phase.dt *= dt_scale_;
+      PulmoUserCheck(on_limit_point_ == "stop" || Programme(read_).prescribes_pressure(), options.comm(),
+                     "-ventilator_on_limit_point flow: no phase of %s prescribes a pressure, and a flow passes limit "
+                     "points anyway; leave the option out",
+                     file_.c_str());
     }
     PetscFunctionReturn(PETSC_SUCCESS);
   }
@@ -119,6 +133,7 @@ public:
   {
     facts.ventilator = std::make_shared<Programme>(programme());
     facts.programme_again = [this](bool settles) { return programme(settles); };
+    if (on_limit_point_ == "flow") facts.flow_past_limit_points = limit_point_flow_ * units::mm3_per_ml;
     facts.settling.off = settle_ == "off" && begins_with_breath() && !settles();
     facts.settling.pressure = starting_pressure() != 0;
     if (settle_ == "auto" && begins_with_breath() && !settles())
@@ -144,6 +159,8 @@ public:
     if (facts.free_airway())
       for (const std::string &surface : facts.airway_surfaces)
         c.surface_residual("Q.N q", surface, pressure, f0(surface_residual<P, AirwayFluxKernels::flux>));
+    if (facts.flow_past_limit_points)
+      c.signal("flow_past_limit_point", [](const SignalRow &row) { return row.past_limit ? 1.0 : 0.0; });
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
@@ -222,10 +239,10 @@ private:
     PetscFunctionReturn(PETSC_SUCCESS);
   }
 
-  std::string mode_ = "off", file_, split_ = "auto", settle_ = "auto";
+  std::string mode_ = "off", file_, split_ = "auto", settle_ = "auto", on_limit_point_ = "stop";
   PetscReal pip_ = 6, peep_ = 0, tidal_volume_ = 500, step_volume_ = 100;
   PetscReal inspiration_ = 1, pause_ = 0, expiration_ = 2, ramp_ = 0.1, ramp_down_ = 0;
-  PetscReal settle_duration_ = 2, dt_scale_ = 1;
+  PetscReal settle_duration_ = 2, dt_scale_ = 1, limit_point_flow_ = 0;
   PetscInt breaths_ = 1, steps_ = 8;
   std::vector<Phase> read_;
 };
