@@ -126,7 +126,7 @@ Json diagnosis_json(const Diagnosis &d)
     json["law_limit"] = {{"what", d.own_limit->name()},
                          {"jacobian", d.own_limit->at.J},
                          {"pressure_cmH2O", d.own_limit->at.pressure / units::kPa_per_cmH2O},
-                         {"volume_share_beyond", d.own_limit->beyond}};
+                         {"volume_share_there_or_beyond", d.own_limit->beyond}};
   return json;
 }
 

@@ -30,6 +30,9 @@ constexpr PetscReal no_stiffness = 0.01;
 /// Some laws have none at rest (CM5 against shear): only what is negative beyond rounding is lost.
 constexpr PetscReal rounding = 1e-8;
 
+/// Steps end just before a limit of the law: what is this near it is there.
+constexpr PetscReal at_limit = 0.02;
+
 /// More of the lung than this is no single place.
 constexpr PetscReal large_share = 0.1;
 
@@ -174,8 +177,9 @@ std::vector<OwnLimit> own_limits(const Scene &scene, const Model &model)
   return limits;
 }
 
-/// The limit of the law that most of the lung is beyond. Collective.
-PetscErrorCode look_at_own_limit(const Scene &scene, const Model &model, Vec local, std::optional<OwnLimit> &found)
+/// The limit of the law that most of the lung is beyond; @p lost_share of it is not elliptic. Collective.
+PetscErrorCode look_at_own_limit(const Scene &scene, const Model &model, Vec local, PetscReal lost_share,
+                                 std::optional<OwnLimit> &found)
 {
   std::vector<OwnLimit> limits = own_limits(scene, model);
   std::vector<PointSample> samples;
@@ -193,7 +197,7 @@ PetscErrorCode look_at_own_limit(const Scene &scene, const Model &model, Vec loc
       for (std::size_t q = 0; q < weights.size(); ++q) {
         const PetscReal J = 1 + samples[q].state.J_minus_1, volume = weights[q] * cell.measure;
         for (std::size_t i = 0; i < limits.size(); ++i)
-          if (limits[i].kind == OwnLimit::Kind::waves ? J < limits[i].at.J : J > limits[i].at.J) sums[i] += volume;
+          if (J > (1 - at_limit) * limits[i].at.J) sums[i] += volume;
         sums.back() += volume;
       }
     }
@@ -201,7 +205,8 @@ PetscErrorCode look_at_own_limit(const Scene &scene, const Model &model, Vec loc
   PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, sums.data(), static_cast<PetscMPIInt>(sums.size()), MPIU_REAL, MPI_SUM,
                              PetscObjectComm((PetscObject)model.dm())));
   for (std::size_t i = 0; i < limits.size(); ++i) {
-    limits[i].beyond = sums[i] / sums.back();
+    // shear has a share in where it is lost, J alone does not tell
+    limits[i].beyond = limits[i].kind == OwnLimit::Kind::waves ? lost_share : sums[i] / sums.back();
     if (limits[i].beyond > (found ? found->beyond : 0)) found = limits[i];
   }
   PetscFunctionReturn(PETSC_SUCCESS);
@@ -227,7 +232,7 @@ std::string own_limit_text(const Scene &scene, const OwnLimit &limit)
     text << "is not elliptic below J = " << limit.at.J << " (" << pressure << " cmH2O)";
     break;
   }
-  text << "; " << 100 * limit.beyond << " % of the lung is beyond.";
+  text << "; " << 100 * limit.beyond << " % of the lung is there or beyond.";
   return text.str();
 }
 
@@ -422,7 +427,7 @@ PetscErrorCode diagnose(const Scene &scene, const Model &model, const FailureFac
   PetscFunctionBeginUser;
   d = Diagnosis();
   PetscCall(look_at_tissue(scene, model, local, d));
-  PetscCall(look_at_own_limit(scene, model, local, d.own_limit));
+  PetscCall(look_at_own_limit(scene, model, local, d.lost_share, d.own_limit));
   PetscCall(model.measure(local, last));
   const bool well = last.min_J > well_formed;
   if (inverted)

@@ -70,7 +70,7 @@ struct OwnLimit {
   Kind kind = Kind::pressure;
   LawRange::State at = {1, 0};   ///< -, kPa
   PetscReal stiffness_share = 0; ///< dp/dJ there over that at rest, of a plateau
-  PetscReal beyond = 0;          ///< share of the volume of the last good state that is beyond
+  PetscReal beyond = 0;          ///< share of the volume of the last good state that is there or beyond
   const char *name() const;      ///< of the kind, as in failure.json
 };
 
