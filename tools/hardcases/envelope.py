@@ -14,7 +14,7 @@ import numpy as np
 from scipy.optimize import brentq, minimize_scalar
 
 from shared import keys
-from shared.common import markdown, write_csv
+from shared.common import SOURCE, laws_of, markdown, processor, write_csv
 
 from .lab import Lab, children_cpu, first_sentence, pulmo
 from .laws import ma_soft_in_shear
@@ -34,6 +34,19 @@ CHECKS = {"linear systems by factors": lambda law: pulmo.options_file("solvers/r
 LONGEST = 900  # s of a run
 # of the tests, on lung_test, and what becomes of them
 SLICE = {("PCV 15/5", False, "yoshihara"): "finishes", ("PCV 25/10", False, "ma"): "law's limit", ("PCV 25/10", False, "berger"): "missed"}
+
+
+def arguments(parser):
+    parser.add_argument("--clinical", nargs="*", metavar="LUNG", choices=list(MESHES),
+                        help=f"lungs of the clinical envelope ({', '.join(MESHES)}; default: all); nothing else runs")
+    parser.add_argument("--laws", nargs="+", metavar="LAW", help="with --clinical: these laws alone (default: all that the program offers)")
+
+
+def called(options, build):
+    """What a call of the tool asks for; its exit code."""
+    keys.lock(build / "hard_cases")
+    return told(build / "pulmo", options.clinical or list(MESHES), laws_of(options), build / "hard_cases/clinical.jsonl",
+                options.output or SOURCE / "docs/hard_cases", processor())
 
 
 # ---- lungs
