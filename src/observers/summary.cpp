@@ -139,9 +139,15 @@ Json diagnosis_json(const Diagnosis &d)
                {"acoustic_stiffness_at_rest_kPa", d.acoustic_at_rest},
                {"not_elliptic_volume_share", d.lost_share},
                {"worst_cell_mm", nullptr},
-               {"distance_from_rim_mm", nullptr}};
+               {"distance_from_rim_mm", nullptr},
+               {"law_limit", nullptr}};
   if (d.worst) json["worst_cell_mm"] = {d.worst->where[0], d.worst->where[1], d.worst->where[2]};
   if (d.from_rim) json["distance_from_rim_mm"] = *d.from_rim;
+  if (d.own_limit)
+    json["law_limit"] = {{"what", d.own_limit->name()},
+                         {"jacobian", d.own_limit->at.J},
+                         {"pressure_cmH2O", d.own_limit->at.pressure / units::kPa_per_cmH2O},
+                         {"volume_share_there_or_beyond", d.own_limit->beyond}};
   return json;
 }
 

@@ -3,6 +3,8 @@
 stability_test, which makes those runs."""
 import unittest
 
+from scipy.optimize import brentq, minimize_scalar
+
 import defaults_test
 import pulmo_case as pulmo
 
@@ -47,16 +49,56 @@ class Failure(unittest.TestCase):
             self.assertLess(abs(found["inflation_stiffness_cmH2O"]), 0.5)  # 47 at rest
             self.assertAlmostEqual(found["acoustic_stiffness_kPa"], 2 * 1.298, places=6)
             self.assertEqual(found["not_elliptic_volume_share"], 0)
+            # p = 2 c (J^(-1/3) - J^(-2 beta - 1)) is largest at J^(2 beta + 2/3) = 3 (2 beta + 1)
+            J = 7.5 ** (1 / (1.5 + 2 / 3))
+            self.expect_own_limit(case, "pressure", J, 2 * 1.298 * (J ** (-1 / 3) - J**-2.5) / pulmo.KPA_PER_CMH2O,
+                                  "holds no more than 16.83 cmH2O (dp/dJ = 0 at J = 2.534)")
+            self.assertAlmostEqual(found["law_limit"]["volume_share_there_or_beyond"], 1, places=12)
+
+    def expect_own_limit(self, case, what, J, pressure, *words):
+        """Of the law, as failure.json and the message have it."""
+        found = case.json("failure.json")["diagnosis"]["law_limit"]
+        self.assertEqual(found["what"], what)
+        self.assertAlmostEqual(found["jacobian"], J, delta=1e-6 * J)
+        self.assertAlmostEqual(found["pressure_cmH2O"], pressure, delta=1e-6 * (1 + abs(pressure)))
+        for word in ("The law's own limit: ", f"; {100 * found['volume_share_there_or_beyond']:.4g} % of the lung is there or beyond.", *words):
+            self.assertIn(word, case.err)
+
+    def test_limits_count_from_the_prestress(self):
+        """The same lung, imaged under 5 cmH2O: J by the volume that it has then, pressures from there."""
+        case, _ = self.expect("everywhere", FREE + pulmo.ROLLERS + [
+            "-tissue", "yoshihara", "-prestress", "-ventilator", "pcv", "-ventilator_pip", "15", "-ventilator_ramp", "1", "-ts_max_time", "1"])
+        p = lambda J: 2 * 1.298 * (J ** (-1 / 3) - J**-2.5) / pulmo.KPA_PER_CMH2O  # noqa: E731
+        J = 7.5 ** (1 / (1.5 + 2 / 3))
+        self.expect_own_limit(case, "pressure", J / brentq(lambda x: p(x) - 5, 1, J), p(J) - 5, "holds no more than 11.83 cmH2O")
+
+    def test_plateau(self):
+        """CM3 beyond the place where dp/dJ of its closed form is least, by volume; then a jump that Newton's method is not given the steps for."""
+        scene = FREE + pulmo.ROLLERS + ["-tissue", "birzle", "-snes_max_it", "6", "-ts_adapt_dt_min", "0.05"]
+        softest = minimize_scalar(lambda J: pulmo.gas_pressure("birzle", J + 1e-4) - pulmo.gas_pressure("birzle", J - 1e-4), bounds=(2, 3),
+                                  method="bounded", options={"xatol": 1e-10}).x
+        for flow, beyond in (1000, False), (7000, True):  # J = 1.5 and 4.5
+            case = pulmo.Case(scene + pulmo.programme(f"in 0.5 flow {flow}\njump 0.1 pressure 2000\n"))
+            self.assertEqual(case.code, 2, case.tail())
+            found = case.json("failure.json")["diagnosis"]
+            if beyond:
+                self.expect_own_limit(case, "plateau", softest, pulmo.gas_pressure("birzle", softest), "has next to no stiffness at J = 2.526 and 5.028 cmH2O")
+                self.assertEqual(found["law_limit"]["volume_share_there_or_beyond"], 1)
+            else:
+                self.assertIsNone(found["law_limit"])
+                self.assertNotIn("The law's own limit", case.err)
 
     def test_ellipticity(self):
         """Suction takes CM2 to J = 0.582, where it loses its stiffness in shear; soft springs on two faces make the state uneven."""
         scene = FREE + ["-chest_wall", "-chest_wall_surfaces", "x0,x1", "-chest_wall_stiffness", "0.001", "-tissue", "ma"]
-        _, found = self.expect("everywhere", scene + pulmo.programme("suction 1 pressure -20 ramp 1"),
+        case, found = self.expect("everywhere", scene + pulmo.programme("suction 1 pressure -20 ramp 1"),
                                "The law ma has no stiffness left at this stretch")
         self.assertAlmostEqual(found["mean_jacobian"], 0.582, delta=0.04)
         self.assertLess(found["acoustic_stiffness_kPa"], 0.05 * found["acoustic_stiffness_at_rest_kPa"])
         self.assertGreater(found["not_elliptic_volume_share"], 0.1)
         self.assertGreater(found["inflation_stiffness_cmH2O"], 10)  # volume is not what gives way
+        # F = s I + g e2 e1^T has d2W/dg2 = 0 at g = 0 where (s^2 - 1) (3 a + b)/2 + ... = 0: tests/unit/failure_test
+        self.expect_own_limit(case, "waves", 0.5818631, -5.3564306, "is not elliptic below J = 0.5819")
 
     def test_solver(self):
         """The tissue is well, and neither the linear solver nor Newton's method is let do its work."""

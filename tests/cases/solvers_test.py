@@ -109,6 +109,10 @@ class Solvers(unittest.TestCase):
 
         for file in ("iterative_hypre.opts", "iterative_ml.opts"):
             self.assertEqual(options(file), options("iterative.opts"), file)
+        spares = ("-snes_lag_", "-newton_refresh", "-predictor_increments", "-ksp_rtol")
+        soft, plain = (text_of("petsc_options/solvers", file).splitlines() for file in ("iterative_soft.opts", "iterative.opts"))
+        self.assertEqual(*([line for line in lines if not line.startswith(("#", *spares))] for lines in (soft, plain)))
+        self.assertEqual([line for line in soft if line.startswith(spares)], ["-predictor_increments 2", "-ksp_rtol 1e-3"])
 
         def but_for_the_displacement(file):
             return [line for line in options(file) if not line.startswith("-fieldsplit_displacement_")]

@@ -1,7 +1,8 @@
 #!/usr/bin/python3
 """A run never passes a state that is turned inside out: it gets past by smaller steps, or it stops and says why.
 
-Also the small size of every case of the gallery (tools/hard_cases), which defines its scenes and demands once.
+Also the small size of every case of the gallery (tools/hard_cases), which defines its scenes and demands once, and a slice of the
+clinical envelope (tools/hard_cases --clinical).
 """
 import os
 import sys
@@ -13,7 +14,8 @@ import failure_test
 import pulmo_case as pulmo
 
 sys.path.insert(0, os.path.join(pulmo.SOURCE, "tools"))
-from hardcases import gallery  # noqa: E402
+from hardcases import envelope, gallery  # noqa: E402
+from hardcases.lab import Lab  # noqa: E402
 
 QUIET = ["-progress", "off"]
 BERGER = pulmo.DIRECT + pulmo.PCV + QUIET + ["-tissue", "berger"]
@@ -101,6 +103,20 @@ class Stability(unittest.TestCase):
                 self.assertLess(rows["newton_iterations"].max(), 10)
                 self.assertLess(summary["krylov_iterations"], 15 * summary["newton_iterations"])
                 np.testing.assert_allclose(rows["volume_ml"], 250 * rows["time_s"], rtol=1e-9, atol=1e-9)
+
+
+class Envelope(unittest.TestCase):
+    """A slice of tools/hard_cases --clinical."""
+
+    def test_breaths_of_a_ward(self):
+        for (setting, prestress, law), verdict in envelope.SLICE.items():
+            with self.subTest(setting=setting, prestress=prestress, law=law):
+                lab = Lab(pulmo.PROGRAM, True)
+                row = envelope.run_one(lab, pulmo.mesh("lung_test.msh"), 1350, setting, prestress, law, checks=False)
+                print(f"{row['cpu_s']:.1f} s CPU ... ", end="", file=sys.stderr, flush=True)
+                self.assertEqual(row["verdict"], verdict, row)
+                self.assertEqual("fault" in row, False, row)
+                self.assertEqual(row["end"] == "finished", verdict == "finishes", row)
 
 
 class Gallery(unittest.TestCase):

@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 import unittest
+from unittest import mock
 
 import numpy as np
 
@@ -20,7 +21,7 @@ sys.path.insert(0, os.path.join(pulmo.SOURCE, "tools"))
 sys.path.insert(0, os.path.join(pulmo.SOURCE, "tests/support"))
 import failed_tests  # noqa: E402
 from benchmarks import assembly, effects, memory, operations, scaling  # noqa: E402
-from hardcases import gallery, page  # noqa: E402
+from hardcases import envelope, gallery, page  # noqa: E402
 from meshing import lung_command, sphere_command  # noqa: E402
 from shared import common, keys  # noqa: E402
 
@@ -551,6 +552,47 @@ class Tools(unittest.TestCase):
         self.assertGreater((folder / "limit_point.png").stat().st_size, 1000)
         self.assertEqual([(row["case"], row["demand"], row["met"]) for row in table(folder / "hard_cases.csv")],
                          [(r["name"], d["what"], str(d["met"])) for r in (limit, plateau) for d in r["demands"]])
+
+    def test_clinical_envelope(self):
+        """What has run is not run again, of another lung or law it is; the page counts, shows why what misses does, and keeps what stands in it by hand."""
+        folder, ran = pathlib.Path(pulmo.scratch()), []
+
+        def one(lab, mesh, volume, setting, prestress, law, checks):
+            ran.append((setting, prestress, law))
+            cost = {"steps": 100, "cut": 1, "newton": 5.25, "krylov": 8.0, "least_J": 0.5, "V_T": 300.0, "C_rs": 30.0, "R": 7.0, "cpu_s": 2.0}
+            row = {"end": "finished", "limit": False, "said": "", "verdict": "costs more" if law == "birzle" else "finishes"} | cost
+            return row | ({"checks": {name: {"end": "finished"} | cost | {"newton": 1.5} for name in envelope.CHECKS}} if checks and law == "birzle" else {})
+
+        def told(lungs, laws):
+            with mock.patch.object(envelope, "run_one", one), contextlib.redirect_stdout(io.StringIO()):
+                return envelope.told(pathlib.Path(pulmo.PROGRAM), lungs, laws, folder / "kept/clinical.jsonl", folder, "a machine")
+
+        self.assertEqual(told(["lung_test"], ["ma"]), 0)
+        self.assertEqual(ran, [(setting, prestress, "ma") for setting in envelope.SETTINGS for prestress in (False, True)])
+        ran.clear()
+        self.assertEqual(told(["lung_test"], ["ma"]), 0)
+        self.assertEqual(ran, [])
+        page_of, own = folder / "clinical_envelope.md", "What was found by hand."
+        page_of.write_text(page_of.read_text().replace(envelope.BEGIN, f"{envelope.BEGIN}\n{own}"))
+        self.assertEqual(told(["lung_test"], ["birzle"]), 1)
+        self.assertEqual(len(ran), 8)
+        text = page_of.read_text()
+        self.assertEqual(text.count(own), 1)
+        self.assertIn("| lung_test | 16 of 56 | 8 | 0 | 8 | 0 |", text)
+        self.assertEqual(text.count("| finished, 5.25 Newton, 8.0 Krylov | finished, 1.50 Newton, 8.0 Krylov |"), 8)
+        rows = table(folder / "clinical_envelope.csv")
+        self.assertEqual([row["verdict"] for row in rows].count("costs more"), 8)
+        self.assertEqual({row["mesh"] for row in rows}, {"lung_test"})
+
+    def test_own_limits_of_the_envelope(self):
+        """CM4's and the plateau of CM3 by their derivatives; none where dp/dJ stays."""
+        J = 7.5 ** (1 / (1.5 + 2 / 3))
+        self.assertAlmostEqual(envelope.own_limit("yoshihara", False)[0], J, places=6)
+        below, at, above = (pulmo.gas_pressure("birzle", envelope.own_limit("birzle", False)[0] * f) for f in (0.99, 1, 1.01))
+        self.assertLess(above - below, 1e-3)
+        self.assertLess(abs(at - 5.028), 1e-3)
+        for law in ("berger", "rausch", "patte"):
+            self.assertIsNone(envelope.own_limit(law, True))
 
     def test_operations_are_counted(self):
         for mnemonic, operands, expected in (("vfmadd231pd", "%ymm1,%ymm2,%ymm3", (8, False)), ("vfnmadd213sd", "(%rax),%xmm1,%xmm2", (2, False)),

@@ -16,6 +16,9 @@ that says what to try; no accepted state has J ≤ 0; no porosity is negative wi
 a number that every run has; no PETSc trace. Seconds are CPU time of the runs of a
 case{where}; they depend on the machine.
 
+Settings of a ward with every law, with and without prestress, on three lungs: [the clinical envelope](clinical_envelope.md), of
+`tools/hard_cases --clinical`.
+
 **{met} of {demands} demands are met, {cases_met} of {cases} cases in full.**{size}
 """
 STALE = "Of another program or other definitions than the rest (run `tools/hard_cases`): {names}."

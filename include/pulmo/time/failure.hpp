@@ -69,6 +69,21 @@ struct FailureFacts {
   std::string phase = "run";
 };
 
+/// Where the law ends by itself in free inflation, F = J^(1/3) I with p = dW/dJ, whatever the mesh and the solver; J is
+/// by the volume of the mesh, and the pressure that of the gas in it.
+struct OwnLimit {
+  enum class Kind {
+    pressure, ///< a limit point: dp/dJ = 0
+    plateau,  ///< dp/dJ falls to next to nothing there, and rises again
+    waves     ///< plane waves meet no stiffness: the law is not elliptic below
+  };
+  Kind kind = Kind::pressure;
+  LawRange::State at = {1, 0};   ///< -, kPa
+  PetscReal stiffness_share = 0; ///< dp/dJ there over that at rest, of a plateau
+  PetscReal beyond = 0;          ///< share of the volume of the last good state that is there or beyond
+  const char *name() const;      ///< of the kind, as in failure.json
+};
+
 /// Where and why.
 struct Diagnosis {
   enum class Kind {
@@ -85,9 +100,10 @@ struct Diagnosis {
   PetscReal acoustic = 0;         ///< acoustic_stiffness() of the mean deformation gradient of the last good state, kPa
   PetscReal acoustic_at_rest = 0; ///< the same at rest, kPa
   bool inflation_lost = false, acoustic_lost = false; ///< next to nothing of them is left
-  PetscReal lost_share = 0; ///< share of the volume whose cells are not elliptic in the last good state
-  std::string limit;        ///< sentence on a limit point of the pressure; empty if there is none
-  const char *name() const; ///< of the kind, as in failure.json
+  PetscReal lost_share = 0;          ///< share of the volume whose cells are not elliptic in the last good state
+  std::string limit;                 ///< sentence on a limit point of the pressure; empty if there is none
+  std::optional<OwnLimit> own_limit; ///< of the law, where part of the lung is beyond it
+  const char *name() const;          ///< of the kind, as in failure.json
 };
 
 /// Looks at the last good state @p local (a local vector). Collective.
