@@ -43,6 +43,9 @@ constexpr Refused refused[] = {
     {"-dm_distribute_overlap", "pulmo works without overlap; leave the option out"},
 };
 
+/// Whether -dm_plex_reorder is not the user's: a run may read several meshes, one after the other.
+bool reorders_by_itself = false;
+
 /// The number of a cell in the file is carried by a label for each digit to this base.
 constexpr PetscInt place_base = 64;
 
@@ -207,7 +210,10 @@ PetscErrorCode Mesh::take_file(const Options &options, Whole &whole)
   // cells that are neighbours in space become neighbours in memory: mesh generators number them at random, and then
   // assembly, products and smoothers mostly wait for memory
   PetscCall(PetscOptionsHasName(nullptr, nullptr, "-dm_plex_reorder", &given));
-  if (!given) PetscCall(PetscOptionsSetValue(nullptr, "-dm_plex_reorder", MATORDERINGRCM));
+  if (!given) {
+    PetscCall(PetscOptionsSetValue(nullptr, "-dm_plex_reorder", MATORDERINGRCM));
+    reorders_by_itself = true;
+  }
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
@@ -233,12 +239,23 @@ PetscErrorCode Mesh::take_saved(const Options &options, Whole &whole)
   SavedMesh file;
   SavedMesh::Slice slice;
   std::string fault;
+  char partitioner[64] = "";
   PetscBool given;
 
   PetscFunctionBeginUser;
   PetscCall(PetscOptionsHasName(nullptr, nullptr, "-dm_plex_reorder", &given));
-  PulmoUserCheck(!given, comm, "-dm_plex_reorder: the cells of %s are in a good order already; leave the option out",
+  if (reorders_by_itself) PetscCall(PetscOptionsClearValue(nullptr, "-dm_plex_reorder"));
+  PulmoUserCheck(!given || reorders_by_itself, comm,
+                 "-dm_plex_reorder: the cells of %s are in a good order already; leave the option out", file_.c_str());
+  // PTScotch (7.0) crashes on graphs that more than four ranks share
+  PetscCall(
+      PetscOptionsGetString(nullptr, nullptr, "-petscpartitioner_type", partitioner, sizeof(partitioner), &given));
+  PulmoUserCheck(!given || std::strcmp(partitioner, "ptscotch") != 0, comm,
+                 "-petscpartitioner_type ptscotch crashes on a mesh that ranks read together, such as %s; leave the "
+                 "option out (METIS then makes the parts)",
                  file_.c_str());
+  parts_by_metis_ = !given;
+  if (parts_by_metis_) PetscCall(PetscOptionsSetValue(nullptr, "-petscpartitioner_type", "metis"));
   PetscCall(read_saved_mesh(comm, file_, file, slice, fault));
   PulmoUserCheck(fault.empty(), comm, "-dm_plex_filename %s %s", file_.c_str(), fault.c_str());
   PetscCall(check_settled(comm, file));
@@ -269,11 +286,13 @@ PetscErrorCode Mesh::read(const Options &options, bool ventilated)
   if (rank == 0) saved = is_saved_mesh(file_);
   PetscCall(from_root(comm, saved));
   places_.clear();
+  parts_by_metis_ = false;
   if (saved)
     PetscCall(take_saved(options, whole));
   else
     PetscCall(take_file(options, whole));
   PetscCall(DMSetFromOptions(dm_)); // reorders, distributes, refines
+  if (parts_by_metis_) PetscCall(PetscOptionsClearValue(nullptr, "-petscpartitioner_type"));
   if (options.varies_by_cell()) PetscCall(read_places());
   PetscCall(DMViewFromOptions(dm_, nullptr, "-dm_view"));
   for (Part &part : parts_) PetscCall(DMGetLabel(dm_, part.name.c_str(), &part.label));

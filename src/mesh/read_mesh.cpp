@@ -1,5 +1,6 @@
 #include "pulmo/mesh/read_mesh.hpp"
 
+#include "pulmo/base/hdf5_image.hpp"
 #include "pulmo/mesh/elements.hpp"
 #include "pulmo/mesh/msh.hpp"
 #include "pulmo/mesh/saved_mesh.hpp"
@@ -119,10 +120,15 @@ PetscErrorCode read_other(const std::string &file, MeshFile &mesh, std::string &
   PetscFunctionBeginUser;
   PetscCall(PetscOptionsGetString(nullptr, nullptr, "-dm_plex_name", name, sizeof(name), nullptr));
   PetscCall(PetscPushErrorHandler(PetscReturnErrorHandler, nullptr));
-  const bool readable = DMPlexCreateFromFile(PETSC_COMM_SELF, file.c_str(), name, PETSC_TRUE, dm.out()) == 0;
+  bool readable;
+  {
+    const QuietHdf5 quiet; // of PETSc's own .h5
+    readable = DMPlexCreateFromFile(PETSC_COMM_SELF, file.c_str(), name, PETSC_TRUE, dm.out()) == 0;
+  }
   PetscCall(PetscPopErrorHandler());
   if (!readable) {
-    fault = "is not a readable mesh; pulmo reads gmsh's MSH 2.2 and 4.1 (ASCII or binary), in files that end in .msh";
+    fault = "is not a readable mesh, or is damaged; pulmo reads gmsh's MSH 2.2 and 4.1 (ASCII or binary), in files "
+            "that end in .msh, and what -mesh_save wrote";
     PetscFunctionReturn(PETSC_SUCCESS);
   }
   PetscCall(DMGetDimension(dm, &dim));

@@ -152,7 +152,7 @@ private:
   DMHandle dm_;
   std::string file_, save_;
   PetscReal scale_ = 1, volume_ = 0, length_ = 0;
-  bool scale_given_ = false;
+  bool scale_given_ = false, parts_by_metis_ = false; ///< the latter: unless the user says otherwise
   PetscInt cells_ = 0, tetrahedra_ = 0;
   std::vector<PetscInt> places_;
   std::map<std::string, Surface> surfaces_;
@@ -160,7 +160,7 @@ private:
   std::vector<Part> parts_;
 };
 
-/// Makes `-petscpartitioner_type metis` known to PETSc (METIS k-way on the rank that holds the mesh).
+/// Makes `-petscpartitioner_type metis` known to PETSc (METIS k-way, on rank 0).
 PetscErrorCode register_metis_partitioner();
 
 } // namespace pulmo
