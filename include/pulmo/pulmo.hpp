@@ -20,6 +20,8 @@ public:
   PetscErrorCode declare();
   /// Checks the options and builds everything.
   PetscErrorCode setup();
+  /// Checks the options and saves the mesh (-mesh_save); setup() is not called then.
+  PetscErrorCode save_mesh(bool overwrite);
 
   Options &options() { return options_; }
   const Scene &scene() const { return scene_; }

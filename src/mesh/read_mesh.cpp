@@ -1,7 +1,9 @@
 #include "pulmo/mesh/read_mesh.hpp"
 
+#include "pulmo/base/hdf5_image.hpp"
 #include "pulmo/mesh/elements.hpp"
 #include "pulmo/mesh/msh.hpp"
+#include "pulmo/mesh/saved_mesh.hpp"
 
 #include <algorithm>
 #include <filesystem>
@@ -118,10 +120,15 @@ PetscErrorCode read_other(const std::string &file, MeshFile &mesh, std::string &
   PetscFunctionBeginUser;
   PetscCall(PetscOptionsGetString(nullptr, nullptr, "-dm_plex_name", name, sizeof(name), nullptr));
   PetscCall(PetscPushErrorHandler(PetscReturnErrorHandler, nullptr));
-  const bool readable = DMPlexCreateFromFile(PETSC_COMM_SELF, file.c_str(), name, PETSC_TRUE, dm.out()) == 0;
+  bool readable;
+  {
+    const QuietHdf5 quiet; // of PETSc's own .h5
+    readable = DMPlexCreateFromFile(PETSC_COMM_SELF, file.c_str(), name, PETSC_TRUE, dm.out()) == 0;
+  }
   PetscCall(PetscPopErrorHandler());
   if (!readable) {
-    fault = "is not a readable mesh; pulmo reads gmsh's MSH 2.2 and 4.1 (ASCII or binary), in files that end in .msh";
+    fault = "is not a readable mesh, or is damaged; pulmo reads gmsh's MSH 2.2 and 4.1 (ASCII or binary), in files "
+            "that end in .msh, and what -mesh_save wrote";
     PetscFunctionReturn(PETSC_SUCCESS);
   }
   PetscCall(DMGetDimension(dm, &dim));
@@ -151,6 +158,11 @@ PetscErrorCode read_other(const std::string &file, MeshFile &mesh, std::string &
 
 } // namespace
 
+std::string periodic_note(const std::string &file)
+{
+  return "mesh " + file + " ties surfaces to one another ($Periodic); pulmo does not: each of them moves by itself";
+}
+
 PetscErrorCode read_mesh_file(const std::string &file, MeshFile &mesh, std::string &fault)
 {
   std::error_code error;
@@ -166,12 +178,12 @@ PetscErrorCode read_mesh_file(const std::string &file, MeshFile &mesh, std::stri
     const std::string text = content.str();
     fault = read_msh(text, mesh);
     const auto periodic = text.find("$Periodic");
-    if (fault.empty() && periodic != std::string::npos && periodic > 0 &&
-        (text[periodic - 1] == '\n' || text[periodic - 1] == '\r'))
-      PetscCall(PetscPrintf(PETSC_COMM_SELF,
-                            "pulmo: note: mesh %s ties surfaces to one another ($Periodic); pulmo does not: each of "
-                            "them moves by itself\n",
-                            file.c_str()));
+    mesh.periodic =
+        periodic != std::string::npos && periodic > 0 && (text[periodic - 1] == '\n' || text[periodic - 1] == '\r');
+    if (fault.empty() && mesh.periodic)
+      PetscCall(PetscPrintf(PETSC_COMM_SELF, "pulmo: note: %s\n", periodic_note(file).c_str()));
+  } else if (is_saved_mesh(file)) {
+    fault = "is a mesh that -mesh_save wrote: only -dm_plex_filename takes it; give the file that it was made of";
   } else {
     PetscCall(read_other(file, mesh, fault));
   }
@@ -182,10 +194,17 @@ PetscErrorCode check_mesh_file(MPI_Comm comm, const char *option, const std::str
 {
   PetscMPIInt rank;
   std::string fault;
+  bool saved = false;
 
   PetscFunctionBeginUser;
   PetscCallMPI(MPI_Comm_rank(comm, &rank));
-  if (rank == 0) {
+  if (rank == 0) saved = is_saved_mesh(file);
+  PetscCall(from_root(comm, saved));
+  if (saved) {
+    SavedMesh mesh;
+    SavedMesh::Slice slice;
+    PetscCall(read_saved_mesh(comm, file, mesh, slice, fault));
+  } else if (rank == 0) {
     MeshFile mesh;
     PetscCall(read_mesh_file(file, mesh, fault));
   }

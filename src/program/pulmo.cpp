@@ -224,6 +224,15 @@ PetscErrorCode Run::setup()
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+PetscErrorCode Run::save_mesh(bool overwrite)
+{
+  PetscFunctionBeginUser;
+  PetscCall(options_.check_unknown());
+  PetscCall(options_.check_petsc());
+  PetscCall(scene_.save_mesh(options_, overwrite));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 const char *version()
 {
   return PULMO_VERSION;
@@ -270,6 +279,13 @@ PetscErrorCode run(const Registry &registry, bool &finished, const OptionList &s
   PetscCall(PetscOptionsHasHelp(nullptr, &help));
   PetscCall(PetscOptionsHasName(nullptr, nullptr, "-dm_plex_filename", &has_mesh));
   if (help) PetscCall(options.print_help());
+  if (scene.mesh().saves() && !help) {
+    PulmoUserCheck(!replay.in_use() && checkpoint.restart().empty(), comm,
+                   "-mesh_save writes a mesh and stops: leave it or %s out", replay.in_use() ? "-replay" : "-restart");
+    PetscCall(run.save_mesh(output.overwrite()));
+    finished = true;
+    PetscFunctionReturn(PETSC_SUCCESS);
+  }
   if (replay.in_use() && !help) PetscCall(replay.check());
   if (!help || has_mesh) PetscCall(run.setup()); // with -help PETSc lists what it reads for this scene
   if (help) {

@@ -22,6 +22,7 @@ from . import plots, runs
 from .plots import plt
 from .strategies import solver_words
 
+READING = SOURCE / "docs/performance/reading.md.in"  # of a mesh of a million tetrahedra, measured by hand
 COUNTS = ("messages", "bytes", "reductions")
 HEADER = ["mesh", "tetrahedra", "dofs", "ranks", "steps", "Newton", "Krylov", "setup s", "residual s/step", "Jacobian s/step",
           "solve s/step", "s/step", "µs/step/tet", "speed-up", "efficiency", "imbalance", "messages/rank/step", "MB/rank/step",
@@ -394,12 +395,14 @@ def run(options):
             "### What breaks first", "",
             f"1. **Reading the mesh**: rank 0 reads the gmsh file and makes its faces and edges alone, {1e6 * reading:.0f} µs per tetrahedron "
             f"({reading * max(options.predict_cells):.0f} s and the whole serial mesh in its memory for {max(options.predict_cells) / 1e6:g}M), however many "
-            "ranks there are.",
+            "ranks there are. A [saved mesh](../meshes.md#large-meshes-a-file-that-ranks-read-together) is read by all of them "
+            "([below](#reading-a-mesh-of-a-million-tetrahedra)).",
             "2. **Direct files**: MUMPS's factors grow faster than the mesh ([memory](memory.md)); its fronts near the root bound the "
             "speed-up. Beyond some 10⁵ tetrahedra only `iterative` is an option.",
             "3. **Coarse levels**: every level of multigrid sends messages to all neighbours however few rows it has left; that is the latency "
             "share above. `-fieldsplit_displacement_pmg_coarse_pc_gamg_process_eq_limit` gathers small levels on fewer ranks.",
-            "4. **Reductions** grow with log₂ P only, and FGMRES makes one or two per iteration; they matter last."]
+            "4. **Reductions** grow with log₂ P only, and FGMRES makes one or two per iteration; they matter last.", "",
+            *READING.read_text(encoding="utf-8").splitlines()]
     write_table(options.output, "scaling", "Scaling", HEADER, table, notes, more)
     print("\nmodel:")
     show(MODEL_HEADER, lines)

@@ -4,6 +4,7 @@
 
 #include "pulmo/mesh/elements.hpp"
 #include "pulmo/mesh/mesh_file.hpp"
+#include "pulmo/mesh/saved_mesh.hpp"
 
 #include <functional>
 #include <map>
@@ -53,11 +54,17 @@ public:
     PetscReal x[3] = {0, 0, 0}; ///< mm
   };
 
-  /// Declares -mesh_scale and -mesh_prefer; the file name is PETSc's -dm_plex_filename.
+  /// Declares -mesh_scale, -mesh_prefer and -mesh_save; the file name is PETSc's -dm_plex_filename.
   PetscErrorCode declare(Options &options);
   /// Reads -dm_plex_filename, renumbers, distributes, scales and checks it. @p ventilated: the scene is a lung, so a
   /// volume outside what any lung has betrays the wrong unit.
   PetscErrorCode read(const Options &options, bool ventilated);
+
+  /// Whether the mesh is to be saved, and no more.
+  bool saves() const { return !save_.empty(); }
+  /// Reads and checks -dm_plex_filename and writes it to the file of -mesh_save (-mesh_scale and -mesh_prefer with it).
+  /// @p overwrite: also where there is a file of that name.
+  PetscErrorCode save(const Options &options, bool overwrite);
 
   /// For each cell of this rank, counted from 0, the number of its tetrahedron in the mesh file; with -dm_refine that
   /// of the tetrahedron it is a piece of. Empty unless the options of read() vary by cell.
@@ -109,22 +116,43 @@ public:
   }
 
 private:
+  /// How many cells there are in the file, and their volume, mm^3.
+  struct Whole {
+    PetscInt cells = 0;
+    PetscReal volume = 0;
+  };
+
+  /// Takes the name of the file from the options.
+  PetscErrorCode name_file(MPI_Comm comm);
+  /// Reads the file on rank 0.
+  PetscErrorCode read_on_root(MPI_Comm comm, NamedMesh &file, bool *periodic = nullptr);
+  /// The mesh of the file, its labels and parts; all cells on rank 0.
+  PetscErrorCode take_file(const Options &options, Whole &whole);
+  /// The same of a file of -mesh_save; cells as they follow one another in the file, as many on each rank.
+  PetscErrorCode take_saved(const Options &options, Whole &whole);
+  /// User error unless -mesh_scale and -mesh_prefer, where they are given, are those that the file was made with.
+  PetscErrorCode check_settled(MPI_Comm comm, const SavedMesh &file) const;
   /// Makes the mesh and its labels on rank 0.
   PetscErrorCode build(MPI_Comm comm, const NamedMesh &file);
+  /// Makes the mesh and its labels of what each rank has read.
+  PetscErrorCode build(MPI_Comm comm, const SavedMesh &file, const SavedMesh::Slice &slice);
+  /// Labels for the parts.
+  PetscErrorCode create_labels();
   /// User error unless number, area and volume of every part are those of the file.
   PetscErrorCode check_parts(MPI_Comm comm, PetscInt cells_in_file, PetscReal volume_of_file) const;
   PetscErrorCode check_cells(const Options &options);
   PetscErrorCode find_surfaces(const Options &options);
   /// Labels that carry the number of each cell in the file through reordering, distribution and refinement.
-  PetscErrorCode label_places(const NamedMesh &file);
+  /// @p place: of the cells of this rank.
+  PetscErrorCode label_places(const std::vector<int> &place);
   /// Reads these labels and takes them away.
   PetscErrorCode read_places();
   std::string surface_names() const;
 
   DMHandle dm_;
-  std::string file_;
+  std::string file_, save_;
   PetscReal scale_ = 1, volume_ = 0, length_ = 0;
-  bool scale_given_ = false;
+  bool scale_given_ = false, parts_by_metis_ = false; ///< the latter: unless the user says otherwise
   PetscInt cells_ = 0, tetrahedra_ = 0;
   std::vector<PetscInt> places_;
   std::map<std::string, Surface> surfaces_;
@@ -132,7 +160,7 @@ private:
   std::vector<Part> parts_;
 };
 
-/// Makes `-petscpartitioner_type metis` known to PETSc (METIS k-way on the rank that holds the mesh).
+/// Makes `-petscpartitioner_type metis` known to PETSc (METIS k-way, on rank 0).
 PetscErrorCode register_metis_partitioner();
 
 } // namespace pulmo

@@ -39,6 +39,7 @@ struct MeshFile {
   std::vector<Element<4>> cells;            ///< left- or right-handed, in the order of the file
   std::vector<Element<3>> facets;
   std::vector<Group> groups;
+  bool periodic = false; ///< ties surfaces to one another, of which pulmo takes no heed
 };
 
 /// A tetrahedral mesh and the parts of it that have names. Neither the numbers of nodes, elements and groups in the

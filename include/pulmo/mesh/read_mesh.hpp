@@ -11,7 +11,11 @@ namespace pulmo {
 /// sentence that says how to fix it; empty if nothing is.
 PetscErrorCode read_mesh_file(const std::string &file, MeshFile &mesh, std::string &fault);
 
-/// Looks at a mesh file on rank 0 alone, so that an unreadable one is a clear error on all ranks that names @p option.
+/// What a user is told of MeshFile::periodic.
+std::string periodic_note(const std::string &file);
+
+/// Looks at a mesh file, on rank 0 alone unless ranks read it together, so that an unreadable one is a clear error on
+/// all ranks that names @p option.
 PetscErrorCode check_mesh_file(MPI_Comm comm, const char *option, const std::string &file);
 
 } // namespace pulmo

@@ -34,6 +34,7 @@ public:
 
   std::string path(const std::string &file) const { return directory_ + "/" + file; }
   const std::string &directory() const { return directory_; }
+  bool overwrite() const { return overwrite_; }
   bool progress() const { return progress_; }
   PetscReal fields_every() const { return fields_every_; } ///< s; 0: at phase ends
   /// Remembered quantities that snapshots hold, or `all`.

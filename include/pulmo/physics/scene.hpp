@@ -17,6 +17,8 @@ public:
 
   /// Declares the options of every effect and of the mesh.
   PetscErrorCode declare(Options &options);
+  /// Does no more than save the mesh; prepare() is not called then.
+  PetscErrorCode save_mesh(const Options &options, bool overwrite) { return mesh_.save(options, overwrite); }
   /// Reads the mesh and checks every active effect against it.
   PetscErrorCode prepare(Options &options);
   /// What the active effects put together.
