@@ -574,7 +574,10 @@ class Tools(unittest.TestCase):
         self.assertEqual(ran, [])
         page_of, own = folder / "clinical_envelope.md", "What was found by hand."
         page_of.write_text(page_of.read_text().replace(envelope.BEGIN, f"{envelope.BEGIN}\n{own}"))
+        self.assertIn("with a windpipe (not made yet", page_of.read_text())
+        shutil.copy(pulmo.mesh("lung_test.msh"), folder / "kept/clinical_mask.msh")
         self.assertEqual(told(["lung_test"], ["birzle"]), 1)
+        self.assertIn("with a windpipe (1,324 tetrahedra)", page_of.read_text())
         self.assertEqual(len(ran), 8)
         text = page_of.read_text()
         self.assertEqual(text.count(own), 1)

@@ -256,7 +256,7 @@ def short(value, digits="{:.3g}"):
 def cells_of(mesh):
     """Number of tetrahedra of a mesh, as words; of one that is not there yet: it has to be made."""
     from meshing.msh import read_mesh
-    return f"{len(read_mesh(mesh).tets):,}" if mesh.exists() else "not made yet, about 4,500"
+    return f"{len(read_mesh(str(mesh)).tets):,}" if mesh.exists() else "not made yet, about 4,500"
 
 
 def tidal(volume):
