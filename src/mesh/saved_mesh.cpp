@@ -18,6 +18,9 @@ using Json = nlohmann::ordered_json;
 /// Marks a file of pulmo, and tells how to read it. Raise it when a name or a meaning changes.
 constexpr const char *marker = "pulmo_mesh";
 constexpr int format = 1;
+constexpr const char *check_of_about = "checksum_of_about";
+constexpr std::size_t image_growth = 1 << 20; // bytes
+constexpr std::size_t place_of_flags = 11;    // in a file of HDF5's
 
 constexpr const char *save_anew = "save it anew with -mesh_save";
 constexpr std::size_t longest_about = std::size_t(1) << 28; // bytes
@@ -49,6 +52,21 @@ std::uint64_t checksum(const T *values, std::size_t n, std::uint64_t first)
   std::uint64_t sum = 0;
   for (std::size_t i = 0; i < n; ++i) sum += scramble(scramble(first + i) ^ bits_of(values[i]));
   return sum;
+}
+
+std::uint64_t text_checksum(const std::string &text)
+{
+  return checksum(std::vector<int>(text.begin(), text.end()).data(), text.size(), 0);
+}
+
+/// Whether HDF5 reads an image.
+bool opens(std::vector<char> &image)
+{
+  const Hdf5Id access(H5Pcreate(H5P_FILE_ACCESS), H5Pclose);
+  if (H5Pset_fapl_core(access, image_growth, 0) < 0 || H5Pset_file_image(access, image.data(), image.size()) < 0)
+    return false;
+  const Hdf5Id file(H5Fopen("image to read", H5F_ACC_RDONLY, access), H5Fclose);
+  return file >= 0;
 }
 
 /// The datasets of a file: what one row has, and the checksums of all.
@@ -217,6 +235,10 @@ std::string read_header(const std::string &file, std::string &about)
   about.resize(static_cast<std::size_t>(n));
   if (H5Dread(set, H5T_NATIVE_UCHAR, H5S_ALL, H5S_ALL, H5P_DEFAULT, about.data()) < 0)
     return std::string("is damaged: what it says of the mesh cannot be read; ") + save_anew;
+  std::uint64_t said = 0;
+  const Hdf5Id check(H5Aopen(opened, check_of_about, H5P_DEFAULT), H5Aclose);
+  if (check < 0 || H5Aread(check, H5T_NATIVE_UINT64, &said) < 0 || said != text_checksum(about))
+    return std::string("is damaged: what it says of the mesh is not what was written; ") + save_anew;
   return "";
 }
 
@@ -368,18 +390,31 @@ std::vector<char> image_of(const SavedMesh &about, const NamedMesh &mesh, const 
   }
 
   const std::string text = about_text(saved, checksums_of(whole));
-  const Hdf5Id file(create_hdf5_image(), H5Fclose);
+  // in this version of HDF5's format what it says of itself has checksums: damage there would crash the library
+  const Hdf5Id access(H5Pcreate(H5P_FILE_ACCESS), H5Pclose);
+  if (H5Pset_fapl_core(access, image_growth, 0) < 0 ||
+      H5Pset_libver_bounds(access, H5F_LIBVER_V18, H5F_LIBVER_V110) < 0)
+    return image;
+  const Hdf5Id file(H5Fcreate("image", H5F_ACC_TRUNC, H5P_DEFAULT, access), H5Fclose);
   if (file < 0) return image;
+  const std::uint64_t sum = text_checksum(text);
   const Hdf5Id scalar(H5Screate(H5S_SCALAR), H5Sclose);
   const Hdf5Id mark(H5Acreate2(file, marker, H5T_NATIVE_INT, scalar, H5P_DEFAULT, H5P_DEFAULT), H5Aclose);
-  bool good = mark >= 0 && H5Awrite(mark, H5T_NATIVE_INT, &format) >= 0 &&
-              write_hdf5(file, "about", H5T_NATIVE_UCHAR, {text.size()}, text.data(), true);
+  const Hdf5Id check(H5Acreate2(file, check_of_about, H5T_NATIVE_UINT64, scalar, H5P_DEFAULT, H5P_DEFAULT), H5Aclose);
+  bool good = mark >= 0 && check >= 0 && H5Awrite(mark, H5T_NATIVE_INT, &format) >= 0 &&
+              H5Awrite(check, H5T_NATIVE_UINT64, &sum) >= 0 &&
+              write_hdf5(file, "about", H5T_NATIVE_UCHAR, {text.size()}, text.data(), false);
   each_dataset(whole, [&](std::size_t set, auto *values, std::size_t n, std::uint64_t) {
     const Dataset &data = datasets[set];
     good = good && write_hdf5(file, data.name, data.real ? H5T_NATIVE_DOUBLE : H5T_NATIVE_INT,
-                              shape_of(data, n / data.width), values, true);
+                              shape_of(data, n / data.width), values, false);
   });
   if (!good || !take_hdf5_image(file, image)) image.clear();
+  // HDF5 1.10 takes the mark of an open file off the image, but not out of the checksum
+  if (!image.empty() && !opens(image)) {
+    image[place_of_flags] = 1;
+    if (!opens(image)) image.clear();
+  }
   return image;
 }
 

@@ -204,8 +204,8 @@ class Refused(unittest.TestCase):
 
         cases = {
             "another version": (lambda f: f.attrs.modify("pulmo_mesh", 99), "format 99, and this pulmo reads format 1"),
-            "a name less": (say(b'"name"', b'"mane"'), "says of the mesh what cannot be"),
-            "no parts": (say(b'"parts"', b'"marts"'), "says of the mesh what cannot be"),
+            "a name less": (say(b'"name"', b'"mane"'), "says of the mesh is not what was written"),
+            "no parts": (say(b'"parts"', b'"marts"'), "says of the mesh is not what was written"),
             "a cell": (put("cells", (5, 1), 3), "its cells are not those that were written"),
             "a node": (put("nodes", (2, 1), 0.5), "its nodes are not those that were written"),
             "the last node": (put("nodes", (-1, 2), 0.5), "its nodes are not those that were written"),
@@ -215,7 +215,7 @@ class Refused(unittest.TestCase):
             "no nodes": (lambda f: f.__delitem__("nodes"), "its nodes cannot be read"),
             "no cells": (lambda f: f.__delitem__("cells"), "its cells cannot be read"),
             "not what is said": (lambda f: f.__delitem__("about"), "what it says of the mesh is gone"),
-            "an area": (say(b'"measure": 500.', b'"measure": 501.'), "in the file, but"),
+            "an area": (say(b'"measure": 500.', b'"measure": 501.'), "is not what was written"),
             "no mark": (lambda f: f.attrs.__delitem__("pulmo_mesh"), "is not a readable mesh"),
         }
         for what, (change, said) in cases.items():

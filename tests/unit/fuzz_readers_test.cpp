@@ -5,6 +5,7 @@
 #include "pulmo/input/command_line.hpp"
 #include "pulmo/input/programme.hpp"
 #include "pulmo/mesh/msh.hpp"
+#include "pulmo/mesh/saved_mesh.hpp"
 
 #include <algorithm>
 #include <cctype>
@@ -244,6 +245,59 @@ TEST(Fuzz, MeshesOfRandomBytes)
     for (unsigned n = random() % 300; n > 0; --n) text += static_cast<char>(random());
     ASSERT_NE(fault_of(text), "");
   }
+}
+
+/// What a saved mesh says, all of it; empty if it is refused.
+std::string said_by_saved_mesh(const std::string &file)
+{
+  SavedMesh mesh;
+  SavedMesh::Slice slice;
+  std::string fault;
+  std::ostringstream text;
+  if (!is_saved_mesh(file)) return "";
+  EXPECT_EQ(static_cast<int>(read_saved_mesh(PETSC_COMM_SELF, file, mesh, slice, fault)), 0);
+  if (!fault.empty()) return "";
+  text.precision(17);
+  for (const auto &p : mesh.parts)
+    text << p.name << ' ' << p.dimension << ' ' << p.elements << ' ' << p.measure << ' ' << p.inside << '\n';
+  for (const auto &x : slice.nodes) text << x[0] << ' ' << x[1] << ' ' << x[2] << '\n';
+  for (std::size_t c = 0; c < slice.cells.size(); ++c) {
+    for (int i = 0; i < 4; ++i) text << slice.cells[c][i] << ' ' << slice.facets[c][i] << ' ';
+    text << slice.places[c];
+    for (const int part : mesh.volumes[static_cast<std::size_t>(slice.volumes[c])]) text << ' ' << part;
+    text << '\n';
+  }
+  return text.str();
+}
+
+/// A byte that changes is found out, or changes nothing: in names (of any encoding), numbers, and what HDF5 says.
+TEST(Fuzz, SavedMeshes)
+{
+  const Scratch scratch(".h5");
+  MeshFile file;
+  NamedMesh named;
+  std::vector<int> order;
+  ASSERT_EQ(read_msh(content_of(source("meshes/cube_msh41_binary.msh")), file), "");
+  file.groups.front().name = "p\xe9ripherie \xc3\xa9";
+  ASSERT_EQ(make_named_mesh(file, {}, 1, named), "");
+  for (std::size_t c = named.cells.size(); c > 0; --c) order.push_back(static_cast<int>(c) - 1);
+  const std::vector<char> image = image_of(SavedMesh::of(named), named, order);
+  const std::string whole(image.begin(), image.end()), said = said_by_saved_mesh(scratch.write(whole));
+  ASSERT_NE(said.find(file.groups.front().name), std::string::npos) << said;
+  std::mt19937 random(7);
+  int refused = 0;
+  const int n = rounds(500);
+  for (int i = 0; i < n; ++i) {
+    std::string text = whole;
+    const std::size_t at = random() % text.size();
+    text[at] = static_cast<char>(text[at] ^ (1 + random() % 255));
+    const std::string now = said_by_saved_mesh(scratch.write(text));
+    ASSERT_TRUE(now.empty() || now == said) << "byte " << at;
+    refused += now.empty();
+  }
+  EXPECT_GT(refused, n / 50);
+  for (const std::size_t length : {std::size_t(0), std::size_t(20), whole.size() / 2, whole.size() - 1})
+    EXPECT_EQ(said_by_saved_mesh(scratch.write(whole.substr(0, length))), "") << length;
 }
 
 /// Whatever is taken from option files PETSc takes, too, and the list of options gives it back as it was read.
