@@ -4,9 +4,9 @@
 #pragma once
 
 #include "pulmo/fem/model.hpp"
-#include "pulmo/physics/law_range.hpp"
 #include "pulmo/physics/scene.hpp"
 #include "pulmo/physics/signal_row.hpp"
+#include "pulmo/time/own_limit.hpp"
 
 #include <optional>
 #include <string>
@@ -67,21 +67,6 @@ struct FailureFacts {
   bool could_flow_on = false;          ///< -ventilator_on_limit_point could be flow, and is not
   bool past_limit = false;             ///< a flow is prescribed past a limit point
   std::string phase = "run";
-};
-
-/// Where the law ends by itself in free inflation, F = J^(1/3) I with p = dW/dJ, whatever the mesh and the solver; J is
-/// by the volume of the mesh, and the pressure that of the gas in it.
-struct OwnLimit {
-  enum class Kind {
-    pressure, ///< a limit point: dp/dJ = 0
-    plateau,  ///< dp/dJ falls to next to nothing there, and rises again
-    waves     ///< plane waves meet no stiffness: the law is not elliptic below
-  };
-  Kind kind = Kind::pressure;
-  LawRange::State at = {1, 0};   ///< -, kPa
-  PetscReal stiffness_share = 0; ///< dp/dJ there over that at rest, of a plateau
-  PetscReal beyond = 0;          ///< share of the volume of the last good state that is there or beyond
-  const char *name() const;      ///< of the kind, as in failure.json
 };
 
 /// Where and why.
