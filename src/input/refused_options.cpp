@@ -65,6 +65,14 @@ const Refusal refusals[] = {
     {"-snes_grid_sequence", false, "0", "a run has one mesh; use -dm_refine"},
     {"-snes_error_if_not_converged", true, off, "a step that fails is taken again, shorter; leave the option out"},
     {"-ksp_error_if_not_converged", true, off, "a step that fails is taken again, shorter; leave the option out"},
+    // DM
+    {"-petscpartitioner_type", false,
+     "metis,simple,ptscotch"
+#if defined(PETSC_HAVE_PARMETIS)
+     ",parmetis"
+#endif
+     ,
+     "parts of the mesh are made by metis, simple or ptscotch; take one of them"},
     // Mat and Vec
     {"-mat_type", false, "aij,seqaij,mpiaij,baij,seqbaij,mpibaij",
      "the matrix is assembled row by row; leave the option out"},

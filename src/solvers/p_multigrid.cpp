@@ -35,6 +35,9 @@ PetscErrorCode setup_p_multigrid(PC pc)
   PetscCall(MatGetBlockSize(B, &block_size));
   PetscCall(DisplacementBlock::find(B, &view));
   if (!self->mg) {
+    PetscBool aij;
+    PetscCall(PetscObjectBaseTypeCompareAny((PetscObject)B, &aij, MATSEQAIJ, MATMPIAIJ, ""));
+    PulmoUserCheck(aij || view, comm, "-pc_type p_multigrid needs a matrix of type aij: leave -dm_mat_type out");
     DM dm;
     DMHandle p1;
     PetscInt n_fields = 0, rows, fine_rows;

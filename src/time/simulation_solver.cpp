@@ -62,6 +62,19 @@ PetscErrorCode newton_step(SNESLineSearch search, Vec X, Vec Y, PetscBool *chang
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+/// The option that has PETSc make the Jacobian by differences; empty if none does.
+PetscErrorCode by_differences(std::string &option)
+{
+  PetscFunctionBeginUser;
+  option.clear();
+  for (const char *name : {"-snes_fd", "-snes_fd_color"}) {
+    PetscBool given = PETSC_FALSE;
+    PetscCall(PetscOptionsGetBool(nullptr, nullptr, name, &given, nullptr));
+    if (given) option = name;
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 constexpr const char *owner = "pulmo_simulation"; ///< of a matrix that is composed with it
 
 PetscErrorCode matrix_product(Mat A, Vec x, Vec y)
@@ -273,6 +286,13 @@ PetscErrorCode Simulation::offer_fixed_stress(KSP ksp)
   if (type != PC_FIELDSPLIT_SCHUR_PRE_USER) PetscFunctionReturn(PETSC_SUCCESS);
   PulmoUserCheck(model_.own_integration(), options_.comm(),
                  "-pc_fieldsplit_schur_precondition user needs pulmo's own integration; leave -petscfe_type out");
+  std::string differences;
+  PetscCall(by_differences(differences));
+  PulmoUserCheck(
+      differences.empty(), options_.comm(),
+      "-pc_fieldsplit_schur_precondition user is made of pulmo's own Jacobian, and %s makes another; leave it "
+      "out, or take a file such as petsc_options/solvers/direct.opts",
+      differences.c_str());
   PetscCall(fixed_stress_.setup(model_.dm(), model_.assembly()));
   model_.also_fill(fixed_stress_);
   PetscCall(PCFieldSplitSetSchurPre(pc, type, fixed_stress_.matrix()));
@@ -283,15 +303,20 @@ PetscErrorCode Simulation::offer_fixed_stress(KSP ksp)
 PetscErrorCode Simulation::offer_view(KSP ksp)
 {
   PC pc;
-  PetscBool fieldsplit, aij;
+  PetscBool fieldsplit, aij, scales;
   bool reads, fits;
+  std::string differences;
 
   PetscFunctionBeginUser;
   PetscCall(KSPGetPC(ksp, &pc));
+  // where another Jacobian is made, or this one is changed afterwards, the cells' own matrices say nothing of it
+  PetscCall(by_differences(differences));
+  PetscCall(KSPGetDiagonalScale(ksp, &scales));
   PetscCall(PetscObjectTypeCompare((PetscObject)pc, PCFIELDSPLIT, &fieldsplit));
   PetscCall(PetscObjectBaseTypeCompareAny((PetscObject)(Mat)matrix_, &aij, MATSEQAIJ, MATMPIAIJ, ""));
   PetscCall(reads_in_place("fieldsplit_displacement_", reads));
-  if (!fieldsplit || !aij || !reads || !scene_.facts().airflow || !model_.own_integration())
+  if (!fieldsplit || !aij || scales || !differences.empty() || !reads || !scene_.facts().airflow ||
+      !model_.own_integration())
     PetscFunctionReturn(PETSC_SUCCESS);
   PetscCall(p1_.setup(model_.dm(), model_.assembly(), fits));
   if (!fits) PetscFunctionReturn(PETSC_SUCCESS);

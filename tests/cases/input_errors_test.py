@@ -643,8 +643,13 @@ def table(m):
         "unknown line search": (good + ["-snes_linesearch_type", "lemon"], ["Line Search", "lemon", "check its spelling"]),
         "unknown package": (good + ["-pc_factor_mat_solver_type", "superman"],
                             ["-pc_factor_mat_solver_type", "'superman'", "mumps"]),
+        "fixed stress beside differences": (lung + pulmo.options_file("solvers/iterative.opts") + ["-ventilator", "pcv"] + ["-snes_fd_color"],
+                                            ["-pc_fieldsplit_schur_precondition user", "-snes_fd_color", "leave it out"]),
+        "p-multigrid of another matrix": (lung + pulmo.options_file("solvers/iterative.opts") + ["-ventilator", "pcv"] + ["-dm_mat_type", "baij"],
+                                          ["p_multigrid", "-dm_mat_type"]),
         "unknown element type": (good + ["-petscfe_type", "cubist"], ["cubist"]),
-        "unknown partitioner": (good + ["-petscpartitioner_type", "knife"], ["knife"]),
+        "unknown partitioner": (good + ["-petscpartitioner_type", "knife"], ["-petscpartitioner_type knife", "metis"]),
+        "partitioner that this PETSc lacks": (good + ["-petscpartitioner_type", "chaco"], ["-petscpartitioner_type chaco", "metis"]),
         # files and folders
         "missing options file": (good + ["-options_file", pulmo.scratch("no.opts")], ["-options_file", "no.opts", "check its name"]),
         "an options file that asks for a missing one": (

@@ -92,6 +92,18 @@ class Solvers(unittest.TestCase):
         self.assertGreater(case.signals()["max_J"].max(), 3)
         self.assertLessEqual(numbers["krylov_iterations"], 10 * numbers["newton_iterations"])
 
+    def test_no_copy_of_the_displacement_changes_nothing(self):
+        """The same iterations as with PETSc's copy; where PETSc changes the matrix, or makes it by differences, it copies anyway."""
+        short = SPRINGS + ["-airflow"] + PCV + ["-ts_max_time", "0.1"]
+        for ranks, more in (1, []), (2, []), (1, ["-ksp_diagonal_scale"]), (
+                1, ["-snes_fd_color", "-pc_fieldsplit_schur_precondition", "selfp", "-ts_max_time", "0.05"]):
+            with self.subTest(ranks=ranks, options=more):
+                view, copy = (run("iterative.opts", short + more + other, ranks) for other in ([], ["-fieldsplit_displacement_pmg_copy"]))
+                for count in ("newton_iterations", "krylov_iterations"):
+                    self.assertAlmostEqual(view.json()[count], copy.json()[count], delta=1 if ranks > 1 else 0)
+                a, b = (case.signals()["volume_ml"] for case in (view, copy))
+                self.assertLess(np.abs(a - b).max(), 1e-7 * np.abs(b).max())
+
     def test_each_file_names_its_blocks_and_is_documented(self):
         page = text_of("docs/performance/solvers.md")
         for file in solver_files():
