@@ -35,9 +35,6 @@ PetscErrorCode setup_p_multigrid(PC pc)
   PetscCall(MatGetBlockSize(B, &block_size));
   PetscCall(DisplacementBlock::find(B, &view));
   if (!self->mg) {
-    PetscBool aij;
-    PetscCall(PetscObjectBaseTypeCompareAny((PetscObject)B, &aij, MATSEQAIJ, MATMPIAIJ, ""));
-    PulmoUserCheck(aij || view, comm, "-pc_type p_multigrid needs a matrix of type aij: leave -dm_mat_type out");
     DM dm;
     DMHandle p1;
     PetscInt n_fields = 0, rows, fine_rows;
@@ -171,17 +168,22 @@ PetscErrorCode create_p_multigrid(PC pc)
 
 } // namespace
 
-PetscErrorCode reads_in_place(const char *prefix, bool &reads)
+PetscErrorCode reads_in_place(const char *prefix, Mat A, bool &reads)
 {
   const std::string begin = std::string("-") + prefix;
   char type[64] = "";
-  PetscBool single = PETSC_FALSE, copy = PETSC_FALSE;
+  PetscBool single = PETSC_FALSE, copy = PETSC_FALSE, aij;
 
   PetscFunctionBeginUser;
+  reads = false;
   PetscCall(PetscOptionsGetString(nullptr, nullptr, (begin + "pc_type").c_str(), type, sizeof(type), nullptr));
+  if (std::string(type) != "p_multigrid") PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(PetscObjectBaseTypeCompareAny((PetscObject)A, &aij, MATSEQAIJ, MATMPIAIJ, ""));
+  PulmoUserCheck(aij, PetscObjectComm((PetscObject)A),
+                 "%spc_type p_multigrid needs a matrix of type aij: leave -dm_mat_type out", begin.c_str());
   PetscCall(PetscOptionsGetBool(nullptr, nullptr, (begin + "pmg_single").c_str(), &single, nullptr));
   PetscCall(PetscOptionsGetBool(nullptr, nullptr, (begin + "pmg_copy").c_str(), &copy, nullptr));
-  reads = std::string(type) == "p_multigrid" && single && !copy;
+  reads = single && !copy;
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

@@ -303,20 +303,20 @@ PetscErrorCode Simulation::offer_fixed_stress(KSP ksp)
 PetscErrorCode Simulation::offer_view(KSP ksp)
 {
   PC pc;
-  PetscBool fieldsplit, aij, scales;
+  PetscBool fieldsplit, scales;
   bool reads, fits;
-  std::string differences;
+  std::string differences, type;
 
   PetscFunctionBeginUser;
+  PetscCall(wanted_pc(options_.comm(), type));
+  if (type != PCFIELDSPLIT) PetscFunctionReturn(PETSC_SUCCESS);
+  PetscCall(reads_in_place("fieldsplit_displacement_", matrix_, reads));
   PetscCall(KSPGetPC(ksp, &pc));
+  PetscCall(PetscObjectTypeCompare((PetscObject)pc, PCFIELDSPLIT, &fieldsplit)); // not where there is one field
   // where another Jacobian is made, or this one is changed afterwards, the cells' own matrices say nothing of it
   PetscCall(by_differences(differences));
   PetscCall(KSPGetDiagonalScale(ksp, &scales));
-  PetscCall(PetscObjectTypeCompare((PetscObject)pc, PCFIELDSPLIT, &fieldsplit));
-  PetscCall(PetscObjectBaseTypeCompareAny((PetscObject)(Mat)matrix_, &aij, MATSEQAIJ, MATMPIAIJ, ""));
-  PetscCall(reads_in_place("fieldsplit_displacement_", reads));
-  if (!fieldsplit || !aij || scales || !differences.empty() || !reads || !scene_.facts().airflow ||
-      !model_.own_integration())
+  if (!reads || !fieldsplit || scales || !differences.empty() || !scene_.facts().airflow || !model_.own_integration())
     PetscFunctionReturn(PETSC_SUCCESS);
   PetscCall(p1_.setup(model_.dm(), model_.assembly(), fits));
   if (!fits) PetscFunctionReturn(PETSC_SUCCESS);

@@ -11,8 +11,8 @@ namespace pulmo {
 /// problem). Needs a matrix of the displacement alone, or a DisplacementBlock.
 PetscErrorCode register_p_multigrid();
 
-/// Whether options say that the preconditioner with @p prefix is one that needs no copy of its block
-/// (view_displacement).
-PetscErrorCode reads_in_place(const char *prefix, bool &reads);
+/// Whether options say that the preconditioner with @p prefix is a p_multigrid that needs no copy of its block of @p A
+/// (view_displacement). A user error if it is one and A is of a type that it cannot do with.
+PetscErrorCode reads_in_place(const char *prefix, Mat A, bool &reads);
 
 } // namespace pulmo
