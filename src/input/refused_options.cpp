@@ -65,6 +65,11 @@ const Refusal refusals[] = {
     {"-snes_grid_sequence", false, "0", "a run has one mesh; use -dm_refine"},
     {"-snes_error_if_not_converged", true, off, "a step that fails is taken again, shorter; leave the option out"},
     {"-ksp_error_if_not_converged", true, off, "a step that fails is taken again, shorter; leave the option out"},
+    // PC
+    {"-pc_fieldsplit_0_fields", false, "",
+     "the blocks are displacement and pressure, in this order; leave the option out"},
+    {"-pc_fieldsplit_1_fields", false, "",
+     "the blocks are displacement and pressure, in this order; leave the option out"},
     // DM
     {"-petscpartitioner_type", false,
      "metis,simple,ptscotch"

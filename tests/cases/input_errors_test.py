@@ -647,6 +647,8 @@ def table(m):
                                             ["-pc_fieldsplit_schur_precondition user", "-snes_fd_color", "leave it out"]),
         "p-multigrid of another matrix": (lung + pulmo.options_file("solvers/iterative.opts") + ["-ventilator", "pcv"] + ["-dm_mat_type", "baij"],
                                           ["p_multigrid", "-dm_mat_type"]),
+        "blocks in another order": (lung + pulmo.options_file("solvers/iterative.opts") + ["-ventilator", "pcv", "-pc_fieldsplit_0_fields", "1"],
+                                    ["-pc_fieldsplit_0_fields", "in this order"]),
         "unknown element type": (good + ["-petscfe_type", "cubist"], ["cubist"]),
         "unknown partitioner": (good + ["-petscpartitioner_type", "knife"], ["-petscpartitioner_type knife", "metis"]),
         "partitioner that this PETSc lacks": (good + ["-petscpartitioner_type", "chaco"], ["-petscpartitioner_type chaco", "metis"]),
