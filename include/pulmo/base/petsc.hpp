@@ -73,15 +73,6 @@ using OptionItems = PetscOptionItems;
 #define PULMO_PARTITION_WEIGHTS PetscSection, PetscSection, PetscSection
 #endif
 
-inline PetscErrorCode create_global_section(PetscSection local, PetscSF sf, PetscSection *global)
-{
-#if PETSC_VERSION_LT(3, 21, 0)
-  return PetscSectionCreateGlobalSection(local, sf, PETSC_FALSE, PETSC_FALSE, global);
-#else
-  return PetscSectionCreateGlobalSection(local, sf, PETSC_TRUE, PETSC_FALSE, PETSC_FALSE, global);
-#endif
-}
-
 /// All fields, of any degree.
 inline PetscErrorCode copy_fields(DM from, DM to)
 {
