@@ -65,9 +65,9 @@ class Replay(unittest.TestCase):
         return case
 
     def test_limit_point(self):
-        for ranks in (1, 2):
-            with self.subTest(ranks=ranks):
-                self.expect_same(LIMIT, ranks)
+        # one rank: on several MUMPS adds in the order in which messages come, and where the matrix is all but singular two runs of the
+        # same scene part (docs/restart.md)
+        self.expect_same(LIMIT)
 
     def test_fold_at_the_rim(self):
         for ranks in (1, 2):
