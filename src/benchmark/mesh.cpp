@@ -1,5 +1,5 @@
 // What it takes to read a mesh, and to set up a scene on it: wall seconds, and the peak memory of every rank. Called by
-// tools/benchmark reading.
+// hand (docs/performance/scaling.md).
 //
 //   pulmo_mesh_benchmark -dm_plex_filename ... -options_file ... [-benchmark_setup on]
 //

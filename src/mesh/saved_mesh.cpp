@@ -310,24 +310,6 @@ std::string read_slice(const std::string &file, const SavedMesh &mesh, int rank,
   return fault;
 }
 
-/// The first rank's fault becomes that of all.
-PetscErrorCode share_fault(MPI_Comm comm, std::string &fault)
-{
-  PetscMPIInt rank, size;
-
-  PetscFunctionBeginUser;
-  PetscCallMPI(MPI_Comm_rank(comm, &rank));
-  PetscCallMPI(MPI_Comm_size(comm, &size));
-  int first = fault.empty() ? size : rank;
-  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &first, 1, MPI_INT, MPI_MIN, comm));
-  if (first == size) PetscFunctionReturn(PETSC_SUCCESS);
-  std::uint64_t n = fault.size();
-  PetscCallMPI(MPI_Bcast(&n, 1, MPI_UINT64_T, first, comm));
-  fault.resize(n);
-  PetscCallMPI(MPI_Bcast(fault.data(), static_cast<PetscMPIInt>(n), MPI_CHAR, first, comm));
-  PetscFunctionReturn(PETSC_SUCCESS);
-}
-
 } // namespace
 
 SavedMesh SavedMesh::of(const NamedMesh &mesh)
@@ -450,7 +432,7 @@ PetscErrorCode read_saved_mesh(MPI_Comm comm, const std::string &file, SavedMesh
     PetscFunctionReturn(PETSC_SUCCESS);
   }
   fault = read_slice(file, mesh, rank, size, slice);
-  PetscCall(share_fault(comm, fault));
+  PetscCall(from_first(comm, fault));
   if (!fault.empty()) PetscFunctionReturn(PETSC_SUCCESS);
   Checksums sums = checksums_of(slice);
   PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, sums.data(), static_cast<int>(sums.size()), MPI_UINT64_T, MPI_SUM, comm));
@@ -459,7 +441,7 @@ PetscErrorCode read_saved_mesh(MPI_Comm comm, const std::string &file, SavedMesh
       fault = "is damaged: its " + std::string(datasets[set].name) + " are not those that were written; " + save_anew;
   if (fault.empty() && !is_sound(mesh, slice))
     fault = std::string("is damaged: its cells name what it does not hold; ") + save_anew;
-  PetscCall(share_fault(comm, fault));
+  PetscCall(from_first(comm, fault));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

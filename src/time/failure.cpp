@@ -262,39 +262,29 @@ PetscErrorCode check_stable_at_rest(const Options &options, const Scene &scene, 
   const TissueLaw &law = scene.tissue().law();
   const bool varies = model.composition().varying() != nullptr;
   PetscInt begin, end;
-  PetscReal found[4] = {0}; // whether a cell is unstable; where
-  std::string why, given;
+  std::string why, where, given;
 
   PetscFunctionBeginUser;
   PetscCall(DMPlexGetHeightStratum(model.dm(), 0, &begin, &end));
   for (PetscInt c = 0; c < (varies ? end - begin : std::min<PetscInt>(1, end - begin)) && why.empty(); ++c) {
-    PetscReal volume;
+    PetscReal volume, x[3];
     why = unstable_at_rest(law, model.constants_at(c));
-    if (why.empty()) continue;
-    found[0] = 1;
-    PetscCall(DMPlexComputeCellGeometryFVM(model.dm(), begin + c, &volume, found + 1, nullptr));
+    if (why.empty() || !varies) continue;
+    PetscCall(DMPlexComputeCellGeometryFVM(model.dm(), begin + c, &volume, x, nullptr));
+    std::ostringstream text;
+    text << " at (" << x[0] << ", " << x[1] << ", " << x[2] << ") mm";
+    where = text.str();
   }
-  // the first rank that found one tells
   const MPI_Comm comm = options.comm();
-  PetscMPIInt rank, size, teller;
-  PetscCallMPI(MPI_Comm_rank(comm, &rank));
-  PetscCallMPI(MPI_Comm_size(comm, &size));
-  teller = found[0] > 0 ? rank : size;
-  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &teller, 1, MPI_INT, MPI_MIN, comm));
-  if (teller == size) PetscFunctionReturn(PETSC_SUCCESS);
-  int length = static_cast<int>(why.size());
-  PetscCallMPI(MPI_Bcast(&length, 1, MPI_INT, teller, comm));
-  why.resize(static_cast<std::size_t>(length));
-  PetscCallMPI(MPI_Bcast(why.data(), length, MPI_CHAR, teller, comm));
-  PetscCallMPI(MPI_Bcast(found, 4, MPIU_REAL, teller, comm));
+  PetscCall(from_first(comm, why));
+  PetscCall(from_first(comm, where)); // of the same rank
+  if (why.empty()) PetscFunctionReturn(PETSC_SUCCESS);
   for (const auto &[name, value] : options.own_used()) // those of other laws are not in use
     if (name.rfind("-tissue_", 0) == 0) given += (given.empty() ? "" : ", ") + name + " " + value;
-  std::ostringstream where;
-  if (varies) where << " at (" << found[1] << ", " << found[2] << ", " << found[3] << ") mm";
   PulmoUserError(comm,
                  "-tissue %s%s is not stable at rest: %s; change its parameters (%s; -help has the published ones), or "
                  "take another law",
-                 law.name(), where.str().c_str(), why.c_str(), given.c_str());
+                 law.name(), where.c_str(), why.c_str(), given.c_str());
 }
 
 std::optional<LimitPoint> limit_point(const std::vector<SignalRow> &rows, const Measures &last)

@@ -62,17 +62,23 @@ PetscErrorCode newton_step(SNESLineSearch search, Vec X, Vec Y, PetscBool *chang
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 
+/// The first of some switches that is on; empty if none is.
+PetscErrorCode first_on(std::initializer_list<const char *> options, std::string &first)
+{
+  PetscFunctionBeginUser;
+  first.clear();
+  for (const char *option : options) {
+    PetscBool on = PETSC_FALSE;
+    PetscCall(PetscOptionsGetBool(nullptr, nullptr, option, &on, nullptr));
+    if (on && first.empty()) first = option;
+  }
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+
 /// The option that has PETSc make the Jacobian by differences; empty if none does.
 PetscErrorCode by_differences(std::string &option)
 {
-  PetscFunctionBeginUser;
-  option.clear();
-  for (const char *name : {"-snes_fd", "-snes_fd_color"}) {
-    PetscBool given = PETSC_FALSE;
-    PetscCall(PetscOptionsGetBool(nullptr, nullptr, name, &given, nullptr));
-    if (given) option = name;
-  }
-  PetscFunctionReturn(PETSC_SUCCESS);
+  return first_on({"-snes_fd", "-snes_fd_color"}, option);
 }
 
 constexpr const char *owner = "pulmo_simulation"; ///< of a matrix that is composed with it
@@ -196,7 +202,7 @@ PetscErrorCode Simulation::create_solver()
   PetscCall(SNESSetComputeInitialGuess(snes, initial_guess, this));
   PetscCall(compat::set_from_options(ts_));
   PetscCall(offer_fixed_stress(ksp));
-  PetscCall(offer_view(ksp));
+  PetscCall(offer_view(ksp, pc_type));
   PetscCall(lagging_.setup(snes));
   PetscCall(SNESSetConvergenceHistory(snes, nullptr, nullptr, PETSC_DECIDE, PETSC_TRUE));
   PetscBool tests_jacobian;
@@ -231,14 +237,12 @@ PetscErrorCode Simulation::create_solver()
         : split                             ? "-ventilator_flow_split common_pressure"
                                             : "a flow into a lung with -airflow off",
         split ? ", or -ventilator_flow_split uniform" : "");
-    for (const char *option : {"-snes_mf", "-snes_mf_operator", "-snes_fd", "-snes_fd_color"}) {
-      PetscBool given = PETSC_FALSE;
-      PetscCall(PetscOptionsGetBool(nullptr, nullptr, option, &given, nullptr));
-      PulmoUserCheck(!given, comm,
-                     "%s: an airway pressure that is an unknown of its own needs the assembled Jacobian; "
-                     "leave the option out",
-                     option);
-    }
+    std::string other;
+    PetscCall(first_on({"-snes_mf", "-snes_mf_operator", "-snes_fd", "-snes_fd_color"}, other));
+    PulmoUserCheck(other.empty(), comm,
+                   "%s: an airway pressure that is an unknown of its own needs the assembled Jacobian; "
+                   "leave the option out",
+                   other.c_str());
     PetscCall(SNESGetLineSearch(snes, &search));
     PetscCall(SNESLineSearchSetPreCheck(search, newton_step, this));
     // the search for a smaller residual multiplies by the matrix to know the slope
@@ -300,16 +304,15 @@ PetscErrorCode Simulation::offer_fixed_stress(KSP ksp)
 }
 
 /// Where the displacement's preconditioner needs no copy of its block, none is made.
-PetscErrorCode Simulation::offer_view(KSP ksp)
+PetscErrorCode Simulation::offer_view(KSP ksp, const std::string &pc_type)
 {
   PC pc;
   PetscBool fieldsplit, scales;
   bool reads, fits;
-  std::string differences, type;
+  std::string differences;
 
   PetscFunctionBeginUser;
-  PetscCall(wanted_pc(options_.comm(), type));
-  if (type != PCFIELDSPLIT) PetscFunctionReturn(PETSC_SUCCESS);
+  if (pc_type != PCFIELDSPLIT) PetscFunctionReturn(PETSC_SUCCESS);
   PetscCall(reads_in_place("fieldsplit_displacement_", matrix_, reads));
   PetscCall(KSPGetPC(ksp, &pc));
   PetscCall(PetscObjectTypeCompare((PetscObject)pc, PCFIELDSPLIT, &fieldsplit)); // not where there is one field

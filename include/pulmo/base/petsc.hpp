@@ -278,14 +278,32 @@ inline PetscErrorCode from_root(MPI_Comm comm, bool &value)
   value = v != 0;
   PetscFunctionReturn(PETSC_SUCCESS);
 }
-inline PetscErrorCode from_root(MPI_Comm comm, std::string &text)
+/// What rank @p teller knows.
+inline PetscErrorCode from_rank(MPI_Comm comm, PetscMPIInt teller, std::string &text)
 {
   std::uint64_t n = text.size();
 
   PetscFunctionBeginUser;
-  PetscCallMPI(MPI_Bcast(&n, 1, MPI_UINT64_T, 0, comm));
+  PetscCallMPI(MPI_Bcast(&n, 1, MPI_UINT64_T, teller, comm));
   text.resize(n);
-  PetscCallMPI(MPI_Bcast(text.data(), static_cast<PetscMPIInt>(n), MPI_CHAR, 0, comm));
+  PetscCallMPI(MPI_Bcast(text.data(), static_cast<PetscMPIInt>(n), MPI_CHAR, teller, comm));
+  PetscFunctionReturn(PETSC_SUCCESS);
+}
+inline PetscErrorCode from_root(MPI_Comm comm, std::string &text)
+{
+  return from_rank(comm, 0, text);
+}
+/// The text of the first rank that has any becomes that of all.
+inline PetscErrorCode from_first(MPI_Comm comm, std::string &text)
+{
+  PetscMPIInt rank, size;
+
+  PetscFunctionBeginUser;
+  PetscCallMPI(MPI_Comm_rank(comm, &rank));
+  PetscCallMPI(MPI_Comm_size(comm, &size));
+  PetscMPIInt first = text.empty() ? size : rank;
+  PetscCallMPI(MPI_Allreduce(MPI_IN_PLACE, &first, 1, MPI_INT, MPI_MIN, comm));
+  if (first < size) PetscCall(from_rank(comm, first, text));
   PetscFunctionReturn(PETSC_SUCCESS);
 }
 

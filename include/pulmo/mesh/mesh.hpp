@@ -122,14 +122,29 @@ private:
     PetscReal volume = 0;
   };
 
+  /// Options that pulmo sets for PETSc while it reads a mesh: a run may read several, one after the other.
+  class OwnOptions {
+  public:
+    OwnOptions() = default;
+    ~OwnOptions();
+    OwnOptions(const OwnOptions &) = delete;
+    OwnOptions &operator=(const OwnOptions &) = delete;
+    /// Sets one, unless the user gave it.
+    PetscErrorCode set(const char *option, const char *value);
+
+  private:
+    std::vector<const char *> set_;
+  };
+
+  static PetscErrorCode print_notes(MPI_Comm comm, const std::vector<std::string> &notes);
   /// Takes the name of the file from the options.
   PetscErrorCode name_file(MPI_Comm comm);
   /// Reads the file on rank 0.
   PetscErrorCode read_on_root(MPI_Comm comm, NamedMesh &file, bool *periodic = nullptr);
   /// The mesh of the file, its labels and parts; all cells on rank 0.
-  PetscErrorCode take_file(const Options &options, Whole &whole);
+  PetscErrorCode take_file(const Options &options, OwnOptions &own, Whole &whole);
   /// The same of a file of -mesh_save; cells as they follow one another in the file, as many on each rank.
-  PetscErrorCode take_saved(const Options &options, Whole &whole);
+  PetscErrorCode take_saved(const Options &options, OwnOptions &own, Whole &whole);
   /// User error unless -mesh_scale and -mesh_prefer, where they are given, are those that the file was made with.
   PetscErrorCode check_settled(MPI_Comm comm, const SavedMesh &file) const;
   /// Makes the mesh and its labels on rank 0.
@@ -152,7 +167,7 @@ private:
   DMHandle dm_;
   std::string file_, save_;
   PetscReal scale_ = 1, volume_ = 0, length_ = 0;
-  bool scale_given_ = false, parts_by_metis_ = false; ///< the latter: unless the user says otherwise
+  bool scale_given_ = false;
   PetscInt cells_ = 0, tetrahedra_ = 0;
   std::vector<PetscInt> places_;
   std::map<std::string, Surface> surfaces_;

@@ -135,7 +135,8 @@ private:
   /// Ends the run with @p reason if it is asked to stop.
   PetscErrorCode heed_request(TSConvergedReason reason);
   PetscErrorCode offer_fixed_stress(KSP ksp);
-  PetscErrorCode offer_view(KSP ksp);
+  /// @p pc_type: what -pc_type says.
+  PetscErrorCode offer_view(KSP ksp, const std::string &pc_type);
   /// Two times closer than this share of the step are the same.
   static constexpr PetscReal same_time = 1e-9;
   /// Whether two times of this run are the same up to rounding.
